@@ -54,7 +54,9 @@ demo: $(installed)
 WORKERS ?= auto
 pytest := $(bin)/python -m pytest -n $(WORKERS) --dist loadfile
 
+# Compiled modules are kept, whatever the surroundings say: each worker and each command that a test starts would compile them again.
 test test-all test-slow: export OMP_NUM_THREADS = 1
+test test-all test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(installed)
 	$(pytest) -m 'not slow and not gpu'
 

@@ -237,6 +237,7 @@ def test_a_case_that_its_solver_does_not_allow_is_made_by_the_suggested_one(tmp_
     assert solvers == ["elements"] * half + ["same"] * (blind.ATTEMPTS - half)
 
 
+@pytest.mark.slow
 def test_from_a_case_to_its_score(case):
     folder, out = case
     place = out / "answers" / "none" / folder.name

@@ -59,7 +59,13 @@ def of_a_command(path) -> bool:
     return whole and (path.parent.name != "scenes" or "scenes" in content(path))
 
 
-@pytest.mark.parametrize("path", [path for path in CONFIGS if of_a_command(path)], ids=lambda p: p.stem)
+def to_try(path):
+    """The first of a folder; the others, which are built of the same classes, in the slow tier."""
+    first = next(other for other in CONFIGS if other.parent == path.parent and of_a_command(other))
+    return path if path == first or path.parent == ROOT else pytest.param(path, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("path", [to_try(path) for path in CONFIGS if of_a_command(path)], ids=lambda p: p.stem)
 def test_command_line_accepts(path, capsys):
     command = command_of(path)
     assert command is not None, f"no command takes {path.name}"

@@ -44,6 +44,7 @@ def test_a_candidate_of_ones_own_that_is_absent_is_not_named():
     assert (found.answer, found.effects) == ("none", ())
 
 
+@pytest.mark.slow
 def test_arrays_have_the_answer_of_their_folder(tmp_path):
     made.material_test(tmp_path / "rubber")
     content = yaml.safe_load((tmp_path / "rubber" / "test.yaml").read_text())

@@ -181,9 +181,8 @@ def test_sigterm_leaves_the_state_wherever_it_comes(tmp_path, hook):
         assert fitted(state, ckpt_path=state) == fitted(tmp_path / "none.ckpt")
 
 
-@pytest.mark.parametrize(
-    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_light_command_ends_with_the_signal_and_leaves_nothing_half_written(tmp_path, number):
     args = ["trajectories", "--out", "out", "--instances=1", "--held_out=0", "--setup.steps=200000", "--device=cpu", "--progress=false"]
     process = begin(tmp_path, *args)

@@ -12,7 +12,7 @@ import numpy as np
 
 from neuido.discrepancy.report import motion_player, plots
 from neuido.discrepancy.report.reader_units import WRITTEN, Units, reach, rounded
-from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, scored_by, title, worded, words_of
+from neuido.discrepancy.report.wording import FIGURES, Words, leading, listed, parameter_words, scored_by, title, worded, words_of
 
 LIMIT = 6_000_000
 """Largest size of a page [bytes]."""
@@ -309,7 +309,15 @@ def _power(c: Mapping[str, Any], units: Units) -> Table:
     rows = []
     for row in c["power"]:
         size = "any size" if row["up_to"] is None else rounded(units.scaled(row["unit"])[0] * row["up_to"])
-        rows.append((title(row["name"]), row["name"], row["parameter"], size, units.label(row["unit"])))
+        rows.append(
+            (
+                title(row["name"]),
+                row["name"],
+                f"{parameter_words(row['name'], row['parameter'])} ({row['parameter']})",
+                size,
+                units.label(row["unit"]),
+            )
+        )
     return Table("Not excluded", ("effect", "identifier", "figure", "up to", "unit"), rows, SIZES)
 
 

@@ -93,6 +93,96 @@ FIGURES = {
 """Names of the declared values in words."""
 
 
+ORDINALS = ("first", "second", "third", "fourth", "fifth")
+_DIRECTIONS = {  # effect: what its parameters x, y and z are
+    "uniform_acceleration": "acceleration along {}",
+    "magnus": "rate about {}",
+    "position_force": "place along {}",
+    "stiffness_gradient": "slope of log stiffness along {}",
+}
+_WORDS = {
+    "gravity.g": "acceleration",
+    "drag_linear.k": "drag coefficient",
+    "drag_quadratic.k": "drag coefficient",
+    "position_force.k": "stiffness over mass",
+    "time_force.interval": "time between two knots",
+    "viscosity_shear.eta": "shear viscosity",
+    "viscosity_bulk.zeta": "bulk viscosity",
+    "maxwell.ratio": "stiffness that relaxes, over that of the law",
+    "maxwell.time": "relaxation time",
+    "hysteresis.eta": "loss factor",
+    "strain_stiffening.k": "stiffening coefficient",
+    "second_invariant.c": "coefficient",
+    "tension_compression.r": "stiffness added in compression, over the shear modulus",
+    "fibre.c": "fibre stiffness",
+    "fibre.azimuth": "azimuth of the fibre",
+    "fibre.elevation": "elevation of the fibre",
+    "yield.inverse": "one over the yield stress",
+    "hardening.h": "hardening modulus",
+    "softening.s": "softening coefficient",
+    "kinematic_hardening.h": "hardening modulus",
+    "rate_yield.eta": "viscosity",
+    "stiffness_gradient.log_ratio": "log of the stiffness in a ball over that outside",
+    "stiffness_gradient.radius": "radius of the ball",
+    "stiffness_gradient.cx": "centre of the ball along x",
+    "stiffness_gradient.cy": "centre of the ball along y",
+    "stiffness_gradient.cz": "centre of the ball along z",
+    "stiffness_gradient.width": "width of the ball's edge",
+    "stiffness_change.rate": "rate of change",
+    "friction.mu": "friction coefficient beside the declared one",
+    "stick.rate": "rate of sticking",
+    "restitution.rate": "rate of damping",
+    "cohesion.c": "cohesion",
+    "added_mass.c": "added share of the mass",
+    "swelling.rate": "rate of growth",
+    "spin_decay.k": "rate of decay",
+    "relaxation_spectrum.first": "shortest relaxation time",
+    "relaxation_spectrum.last": "longest relaxation time",
+    "fractional.ratio": "stiffness that relaxes, over that of the law",
+    "fractional.exponent": "exponent",
+    "fractional.time": "time in the middle of the decay",
+    "mullins.share": "share of the stress that is lost",
+    "mullins.width": "width of the softening",
+    "permanent_set.share": "share of the strain that stays",
+    "compaction.k": "coefficient",
+    "compaction.lock": "strain at which it locks",
+    "creep.rate": "creep rate",
+    "creep.exponent": "exponent",
+    "creep.stress": "reference stress",
+    "cyclic_hardening.q": "change of the yield stress",
+    "cyclic_hardening.b": "rate of saturation",
+    "rate_power.k": "consistency",
+    "rate_power.n": "exponent",
+    "power_law.n": "exponent",
+    "power_law.reference": "reference rate",
+    "carreau.n": "exponent",
+    "carreau.time": "time constant",
+    "bingham.yield": "yield stress",
+    "herschel_bulkley.yield": "yield stress",
+    "herschel_bulkley.n": "exponent",
+    "herschel_bulkley.reference": "reference rate",
+    "thixotropy.c": "largest rise of the viscosity",
+    "thixotropy.breakdown": "time of breakdown",
+    "thixotropy.build": "rate of build-up",
+}
+
+
+def parameter_words(effect: str, parameter: str) -> str:
+    """Return a parameter of an effect in words; one of an effect outside the library is its name with spaces."""
+    if found := _WORDS.get(f"{effect}.{parameter}"):
+        return found
+    name, number = (parameter[:-1], parameter[-1]) if parameter[-1:].isdigit() else (parameter, "")
+    if effect in _DIRECTIONS and name in ("x", "y", "z") and not number:
+        return _DIRECTIONS[effect].format(name)
+    if effect == "time_force" and number:
+        return f"acceleration along {name} at the {ORDINALS[int(number)]} knot"
+    if effect == "relaxation_spectrum" and number:
+        return f"share of the {ORDINALS[int(number) - 1]} relaxation time"
+    if effect == "nonlinear_backstress" and number:
+        return f"{'modulus' if name == 'h' else 'rate of saturation'} of the {ORDINALS[int(number) - 1]} backstress"
+    return parameter.replace("_", " ")
+
+
 def worded(text: str) -> str:
     """Replace the identifiers of effects in a text by their titles."""
     import re
@@ -242,7 +332,8 @@ def _not_excluded(c: Content, units: Units) -> str:
     out = []
     if sized:
         said = [
-            f"{title(r['name'])} ({r['parameter'].replace('_', ' ')} up to {units.said(r['up_to'], r['unit'])})" for r in sized[:MOST_SAID]
+            f"{title(r['name'])} ({parameter_words(r['name'], r['parameter'])} up to {units.said(r['up_to'], r['unit'])}; {r['parameter']})"
+            for r in sized[:MOST_SAID]
         ]
         more = f" and {len(sized) - MOST_SAID} others, listed in the report" if len(sized) > MOST_SAID else ""
         out.append(f"Not excluded: {listed(said) if not more else ', '.join(said)}{more}.")

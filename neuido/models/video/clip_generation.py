@@ -5,11 +5,11 @@
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -112,7 +112,7 @@ def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: i
             for start in range(0, len(wanted), size):
                 with ThreadPoolExecutor(workers if size > 1 else 1) as pool:
                     group = list(pool.map(lambda i: sample_clip(plan, i), wanted[start : start + size]))
-                    filmed = film_clips(plan, group, chosen)
+                    filmed = film_clips(plan, group, chosen, note=work.print)
                     list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
                 work.update(len(group))
     if (missing or not (folder / "index.json").exists()) and all(whole(name) for name in names):
@@ -153,9 +153,14 @@ def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
     )
 
 
-def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> Iterator[dict[str, Tensor]]:
-    """Simulate and render clips of one family; yield images, masks and samples of the law of each, on the CPU."""
-    for clip, motion in zip(group, _simulate(plan, group, device), strict=True):
+def film_clips(
+    plan: ClipPlan, group: list[ClipSetup], device: torch.device, *, note: Callable[[str], Any] = lambda line: None
+) -> Iterator[dict[str, Tensor]]:
+    """Simulate and render clips of one family; yield images, masks and samples of the law of each, on the CPU.
+
+    `note` is called with a line for each event that makes a motion doubtful.
+    """
+    for clip, motion in zip(group, _simulate(plan, group, device, note), strict=True):
         gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
         cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
         with torch.no_grad():
@@ -164,7 +169,9 @@ def film_clips(plan: ClipPlan, group: list[ClipSetup], device: torch.device) -> 
         yield seen | _samples(motion, clip, plan.samples, int(clip.name.removeprefix("clip-")))
 
 
-def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halvings: int = 0) -> list[ParticleState]:
+def _simulate(
+    plan: ClipPlan, group: list[ClipSetup], device: torch.device, note: Callable[[str], Any], halvings: int = 0
+) -> list[ParticleState]:
     """Simulate the clips together; an unstable clip is repeated alone with half and a quarter of the time step."""
     share = 2**halvings
     scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
@@ -177,10 +184,13 @@ def _simulate(plan: ClipPlan, group: list[ClipSetup], device: torch.device, halv
     except UserError as error:
         if len(group) > 1:
             middle = len(group) // 2
-            return [*_simulate(plan, group[:middle], device, halvings), *_simulate(plan, group[middle:], device, halvings)]
+            return [part for half in (group[:middle], group[middle:]) for part in _simulate(plan, half, device, note, halvings)]
         if halvings == HALVINGS:
             raise UserError(f"{group[0].name}: {error}") from error
-        return _simulate(plan, group, device, halvings + 1)
+        return _simulate(plan, group, device, note, halvings + 1)
+    for event in frames.events:
+        own = event._replace(first=event.first - simulator.particles.offsets[event.scene])
+        note(f"note: {group[event.scene].name}: {own.words}")
     parts = zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])
     return [ParticleState(*(part[:, a:b] for part in frames)) for a, b in parts]
 

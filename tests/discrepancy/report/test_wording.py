@@ -3,7 +3,7 @@
 import pytest
 
 from neuido.discrepancy.report.reader_units import Units, fixed, rounded
-from neuido.discrepancy.report.wording import listed, title, titles, worded, words_of
+from neuido.discrepancy.report.wording import listed, parameter_words, title, titles, worded, words_of
 from neuido.physics.effects.library import LIBRARY
 from tests.discrepancy.report.report_content import content, stress_curve
 
@@ -15,8 +15,15 @@ def test_an_effect_opens_with_its_name_size_and_interval():
     assert words.finding == "The model lacks linear air drag: k = 3.00 per second (90 %: 2.98–3.02)."
     assert words.error == "Held-out error 39.8 mm before, 0.698 mm after; noise 0.693 mm, discretisation 0.361 mm."
     assert "p = 0.01" in words.sure and "the nearest rival, quadratic air drag, leaves 6.0 times the error" in words.sure
-    assert words.not_excluded.startswith("Not excluded: a different gravity (g up to 2.52 m/s²)")
+    assert words.not_excluded.startswith("Not excluded: a different gravity (acceleration up to 2.52 m/s²; g)")
     assert words.paragraphs == (words.finding, words.error, words.sure, words.not_excluded)
+
+
+def test_every_parameter_of_the_library_has_words():
+    words = {f"{entry.name}.{p.name}": parameter_words(entry.name, p.name) for entry in LIBRARY for p in entry.parameters}
+    assert not [key for key, said in words.items() if said == key.partition(".")[2].replace("_", " ") and len(said) < 4]
+    assert words["time_force.y4"] == "acceleration along y at the fifth knot" and words["magnus.x"] == "rate about x"
+    assert parameter_words("own", "spring_rate") == "spring rate"
 
 
 def test_two_effects_and_a_class():

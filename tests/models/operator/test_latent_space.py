@@ -108,6 +108,7 @@ def test_monotonicity():
     assert interpolation.monotonicity([1, 1, 1])["spearman"] == 0.0
 
 
+@pytest.mark.parametrize("operator", [pytest.param(n, marks=[pytest.mark.slow] * (n != "pretrained")) for n in PRETRAINED], indirect=True)
 def test_interpolation_is_softer_to_stiffer(operator):
     """The drop test of the package's weights: apparent stiffness is monotone between the softest and the stiffest elastic latent."""
     ends = interpolation.softest_and_stiffest(operator)

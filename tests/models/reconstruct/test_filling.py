@@ -80,7 +80,7 @@ def test_hull_trims_what_no_mask_shows():
     assert float(opacity_volume(both, spacing=0.01, hull=hull).at(stray.means)) < 0.01
 
 
-@pytest.mark.parametrize("method", ["voxel", "poisson"])
+@pytest.mark.parametrize("method", ["voxel", pytest.param("poisson", marks=pytest.mark.slow)])
 def test_particles_fill_the_body(method):
     hull = visual_hull(*silhouettes(16), (0, 0, 0), (1, 1, 1), resolution=48)
     x, volume = fill(hull, count=4000, method=method)

@@ -329,6 +329,7 @@ class Still(Method):
         return {"pull": float(self.pull.detach())}
 
 
+@pytest.mark.slow
 def test_methods_without_parameters_or_without_laws(tmp_path):
     data = TinyScenes(str(tmp_path), youngs=(5e4,))
     trainer(tmp_path).fit(module(tmp_path, method=Nothing(), steps=None), data)

@@ -104,7 +104,7 @@ def test_metrics_by_hand():
     assert values["val/plastic_error_yielding"].item() == pytest.approx(torch.arange(128.0)[flows].median().item(), rel=0.05)
 
 
-@pytest.mark.parametrize("trunk", ["objective", "raw", "bounded"])
+@pytest.mark.parametrize("trunk", ["objective", *(pytest.param(trunk, marks=pytest.mark.slow) for trunk in ("raw", "bounded"))])
 def test_fit_writes_the_operator_and_test_scores_it(folder, tmp_path, trunk):
     seed_everything(0)
     data = TrajectoryDataModule(str(folder), batch_size=300, validation_samples=50, instance_samples=60)

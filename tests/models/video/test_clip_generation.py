@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from neuido.models.stages.pretrain_vae import FlowVAEModule
 from neuido.models.stages.warmup import WarmupModule, compare_laws
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
+from neuido.physics.runtime.events import CRUSHED, INVERTED, Event
+from neuido.physics.runtime.frames import Frames
 
 TINY = {"count": 9, "views": 2, "frames": 9, "frame_steps": 8, "dts": [2e-3, 1e-3], "cells": 12, "particles": 150, "width": 48,
         "flow_size": 32, "samples": 32, "device": "cpu", "progress": False}  # fmt: skip
@@ -46,6 +49,17 @@ def test_clips(folder):
     assert torch.allclose(elastic(clip.corrected.double()).float(), clip.stress, rtol=1e-3, atol=1.0)
     window = next(iter(data.train_dataloader()))
     assert window.flow.shape == (16, 8, 32, 32, 2)
+
+
+def test_what_makes_a_clip_doubtful_is_printed(tmp_path, monkeypatch, capsys):
+    found = (Event(CRUSHED, 1, 2, 150, 1000, 3, 0.006, 1, 5e-4), Event(INVERTED, 0, 1, 150, 4, 3, 0.006, 1, -0.2))
+    monkeypatch.setattr(Frames, "events", found)
+    film(str(tmp_path / "a"), **{**TINY, "count": 6}, batch=2)
+    noted = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert noted[1::2] == [f"note: clip-0000{k}: {found[1].words}" for k in range(3)]
+    own = [int(re.search(r"particle (\d+)", line)[1]) for line in noted[::2]]  # counted from the clip's first
+    assert noted[::2] == [f"note: clip-0000{k + 3}: {found[0]._replace(first=own[k]).words}" for k in range(3)]
+    assert all(TINY["particles"] / 2 < 1000 - first < 2 * TINY["particles"] for first in own)
 
 
 def test_shards_make_the_same_clips(folder, tmp_path):

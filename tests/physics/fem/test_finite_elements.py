@@ -134,6 +134,7 @@ def test_a_clamped_beam_sags_as_timoshenko_says():
     assert (1 - two) > 2.5 * (1 - four)
 
 
+@pytest.mark.slow
 def test_nodal_smoothing_takes_the_locking_off():
     free, locked, smoothed = sag(160), sag(160, poisson=0.49), sag(160, "nodal", poisson=0.49)
     assert locked < 0.8 * free
@@ -149,6 +150,7 @@ def bounce(make, **options) -> float:
     return float(out.v[-1, :, 1].mean()) / 2.0
 
 
+@pytest.mark.slow
 def test_a_cuboid_rebounds_as_finite_elements_do():
     """Ours and another finite-element code: 0.68 to 0.69; the material point method 0.85 to 0.87: part of the energy is vibration."""
     assert bounce(FiniteElements) < 0.8 < bounce(Simulator)

@@ -110,7 +110,7 @@ def test_a_function_that_fails_is_asked_again():
 def test_threads_that_share_a_simulator_get_their_own_motion():
     body = cube(length=0.2, centre=(0.5, 0.13, 0.5), particles_per_side=4)
     simulator = Simulator(Scene(cells=12, dt=5e-4), body, device="cpu")
-    stiffness = [1e4 * (1 + i) for i in range(8)]
+    stiffness = [1e4 * (1 + i) for i in range(4)]
 
     def motion(young, simulator=simulator):
         law = NeoHookean(torch.tensor([young], requires_grad=True), 0.3)
