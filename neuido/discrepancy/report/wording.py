@@ -98,6 +98,7 @@ _DIRECTIONS = {  # effect: what its parameters x, y and z are
     "uniform_acceleration": "acceleration along {}",
     "magnus": "rate about {}",
     "position_force": "place along {}",
+    "local_force": "place along {}",
     "stiffness_gradient": "slope of log stiffness along {}",
 }
 _WORDS = {
@@ -161,6 +162,14 @@ _WORDS = {
     "herschel_bulkley.yield": "yield stress",
     "herschel_bulkley.n": "exponent",
     "herschel_bulkley.reference": "reference rate",
+    "dry_friction.c": "deceleration",
+    "local_force.a0": "largest acceleration",
+    "local_force.w": "reach",
+    "lift.k": "lift coefficient",
+    "lift.d": "drag coefficient",
+    "buoyancy.q": "density of the fluid over that of the body",
+    "bounce_friction.mu": "friction coefficient",
+    "bounce_speed.p": "exponent of the speed",
     "thixotropy.c": "largest rise of the viscosity",
     "thixotropy.breakdown": "time of breakdown",
     "thixotropy.build": "rate of build-up",
