@@ -7,6 +7,7 @@ import torch
 
 from neuido.data.bodies import shapes
 from neuido.errors import UserError
+from neuido.physics.colliders.solids import Sphere
 from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma
 from neuido.physics.mpm import reference
 from neuido.physics.mpm.simulator import Simulator
@@ -224,6 +225,30 @@ def test_several_scenes_share_a_launch():
     assert torch.allclose(together.x[-1], torch.cat([frames.x[-1] for frames in alone]), atol=1e-12)
     assert together.body_names == ("low", "top", "low", "top", "side")
     assert together.body.unique().tolist() == [0, 1, 2, 3, 4]
+
+
+def test_window_segments_and_tapes_do_not_change_contact():
+    scene = stack(0.3, True)
+
+    def gradient(segment=None, **options):
+        sim = Simulator(scene, device="cpu", dtype=torch.float64, **options)
+        x = sim.state.x.clone().requires_grad_()
+        frames = sim.rollout(10, state=sim.state._replace(x=x), every=5, segment=segment)
+        return frames.x[-1].detach(), torch.autograd.grad(frames.x[-1].square().sum(), x)[0]
+
+    plain = gradient()
+    for other in (gradient(segment=5), gradient(store="all"), gradient(grid="window")):
+        assert all(torch.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in zip(plain, other))
+
+
+def test_solid_collider_takes_what_the_bodies_lose():
+    ball = Sphere(0.1, position=(0.45, 0.62, 0.45), velocity=(0.0, -1.0, 0.0))
+    sim = simulator(stack(0.3, True, gravity=(0.0, 0.0, 0.0), walls=None, colliders=(ball,)))
+    with torch.no_grad():
+        frames = sim.rollout(12, every=12)
+    total = momentum(sim, frames)
+    assert torch.allclose(12e-3 * frames.forces[-1, 0], total[0] - total[-1], atol=1e-10)
+    assert frames.forces[-1, 0, 1] > 100.0
 
 
 def test_friction_of_pairs_is_that_of_their_names():
