@@ -18,14 +18,22 @@ from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth
 from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
+from neuido.physics.effects.point_library import FLUID
 from neuido.physics.laws.classical import material
+from neuido.physics.points.flow_curve import flow_stress
 from neuido.physics.points.material_point import Specimen, stress_along
 from neuido.physics.points.point_mass import Forces, fly
 from neuido.types import Vector
 
 Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
 TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "yield",
-              "hardening", "kinematic_hardening", "rate_yield", "softening", "stiffness_change")  # fmt: skip
+              "hardening", "kinematic_hardening", "rate_yield", "softening", "stiffness_change", "relaxation_spectrum", "fractional",
+              "mullins", "permanent_set", "nonlinear_backstress", "cyclic_hardening", "rate_power", "power_law", "carreau", "bingham",
+              "herschel_bulkley")  # fmt: skip
+YIELDING = ("hardening", "kinematic_hardening", "rate_yield", "nonlinear_backstress", "cyclic_hardening", "rate_power")
+"""Effects of a body that is declared as one that yields."""
+RELATIVE = 0.01
+"""Noise of a flow curve, relative to the stress."""
 TRACK_KINDS = ("gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force")
 PERIOD = 2.0
 """Period of the loading of a specimen [s]."""
@@ -82,7 +90,9 @@ def _rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: 
 
 
 def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
-    plastic = PLASTIC if kind in ("hardening", "kinematic_hardening", "rate_yield") else ELASTIC
+    if kind in FLUID:
+        return _fluid(rng, kind, ratio, name, advance)
+    plastic = PLASTIC if kind in YIELDING else ELASTIC
     if kind == "none" and rng.random() < 0.3:
         plastic = PLASTIC
     young = float(f"{math.exp(rng.uniform(math.log(1e5), math.log(1e6))):.3g}")
@@ -132,7 +142,8 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     }  # fmt: skip
     tests = []
     for (title, mode, role, *_), (t, path), stress in zip(plans, paths, true):
-        tests.append((title, mode, role, np.stack([t, path, stress + noise * rng.normal(size=n)], axis=1)))
+        columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
+        tests.append((title, mode, role, columns, np.stack([t, path, stress + noise * rng.normal(size=n)], axis=1)))
     model = {
         "density": 1000.0,
         "elasticity": {k: start.get(k, v) for k, v in elasticity.items()},
@@ -156,16 +167,64 @@ def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
         "kinematic_hardening": ({"h": 0.05 * young}, "h", 0.02, 10),
         "rate_yield": ({"eta": 0.1 * flow * PERIOD}, "eta", 0.02, 30),
         "softening": ({"s": 0.5}, "s", 0.05, 6),
+        "relaxation_spectrum": (
+            {**{f"g{i}": float(rng.uniform(0.02, 0.2)) for i in range(1, 6)}, "first": 0.02 * PERIOD, "last": 2 * PERIOD},
+            "g1 g2 g3 g4 g5",
+            0.05,
+            20,
+        ),
+        "fractional": ({"ratio": 0.2, "exponent": rng.uniform(0.15, 0.5), "time": 0.2 * PERIOD}, "ratio", 0.05, 20),
+        "mullins": ({"share": 0.1, "width": rng.uniform(0.2, 1.0)}, "share", 0.05, 8),
+        "permanent_set": ({"share": 0.05}, "share", 0.05, 10),
+        "nonlinear_backstress": ({"h1": 0.3 * young, "g1": 15.0}, "h1", 0.02, 20),
+        "cyclic_hardening": ({"q": (-0.2 if rng.random() < 0.5 else 0.3) * flow, "b": 5.0}, "q", 0.02, 3),
+        "rate_power": ({"k": 0.2 * flow, "n": rng.uniform(0.2, 0.6)}, "k", 0.02, 20),
         "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
     }
 
 
-def _write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple[str, str, str, np.ndarray]], folder: Path) -> None:
+def _fluid(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
+    """Draw flow curves of a fluid: one is fitted, and one at other rates is held out."""
+    viscosity = float(f"{math.exp(rng.uniform(math.log(0.1), math.log(100.0))):.3g}")
+    rates = [np.geomspace(0.02, 50.0, 40), np.geomspace(0.05, 120.0, 30)]
+    least = viscosity * 0.02
+    sizes: Sizes = {
+        "power_law": ({"n": -0.3, "reference": 1.0}, "n", 0.05, 2),
+        "carreau": ({"n": -0.4, "time": rng.uniform(0.3, 3.0)}, "n", 0.05, 2),
+        "bingham": ({"yield": 5 * least}, "yield", 0.01, 100),
+        "herschel_bulkley": ({"yield": 10 * least, "n": -rng.uniform(0.3, 0.6), "reference": 1.0}, "yield", 0.01, 100),
+    }
+
+    def stresses(values: Mapping[str, float]) -> list[np.ndarray]:
+        advance(1)
+        given = {key: np.array([value]) for key, value in values.items()}
+        return [np.log(flow_stress(np.array([viscosity]), given, rate)[0]) for rate in rates]
+
+    plain = stresses({})
+    drawn = _effect(rng, kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(stresses(values)[0] - plain[0]))
+    true = stresses(drawn.values) if drawn else plain
+    names, roles = ["curve", "again"], ["fit", "held_out"]
+    truth = {
+        "undeclared": [truth_entry(drawn, free=("viscosity",))] if drawn else [],
+        "measured": "material_test",
+        "material": {"flow": "newtonian", "viscosity": viscosity},
+        "simulated_with": "the flow curve",
+        "noise": RELATIVE,
+        "tests": _rows(true, plain, RELATIVE, roles, names, "1") if drawn else [],
+    }
+    rows = [np.stack([rate, np.exp(y + RELATIVE * rng.normal(size=len(y)))], axis=1) for rate, y in zip(rates, true, strict=True)]
+    declared = float(f"{viscosity * rng.uniform(0.5, 2.0):.3g}")
+    model = {"density": 1000.0, "flow": {"law": "newtonian", "viscosity": declared}, "free": ["viscosity"]}
+    columns = {"shear_rate": "rate_per_s", "shear_stress": "stress_pa"}
+    tests = [(n, "flow_curve", role, columns, own) for n, role, own in zip(names, roles, rows, strict=True)]
+    return functools.partial(_write_tests, name, model, tests), truth
+
+
+def _write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple[str, str, str, dict, np.ndarray]], folder: Path) -> None:
     entries = []
-    for title, mode, role, rows in tests:
-        _write_csv(folder / f"{title}.csv", ("time_s", "stretch", "stress_pa"), rows)
-        columns = {"time": "time_s", "stretch": "stretch", "nominal_stress": "stress_pa"}
-        entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": columns, "role": role})
+    for title, mode, role, columns, rows in tests:
+        _write_csv(folder / f"{title}.csv", tuple(columns.values()), rows)
+        entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": dict(columns), "role": role})
     content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
     write_text(folder / "test.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     read_material_tests(folder)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.physics.effects.parameters import LIBRARY
+from neuido.physics.effects.point_library import POINT_ENTRIES
 
 ELASTIC, PLASTIC, GRAINS = "identity", "von_mises", "drucker_prager"
 ANY, SOLID = (ELASTIC, PLASTIC, GRAINS), (ELASTIC, PLASTIC)
@@ -235,10 +236,27 @@ def draw_effect(kind: str, rng: np.random.Generator, scales: Scales) -> Drawn:
     )
 
 
+ALSO_RIGHT = {"bingham": ("herschel_bulkley",), "power_law": ("herschel_bulkley", "carreau"), "relaxation_spectrum": ("fractional",)}
+"""Effects that have another one as a limit, so that their name is right too."""
+
+
 def truth_entry(drawn: Drawn, *, free: tuple[str, ...] = ()) -> dict:
     """Describe an effect for the list `undeclared` of the key of a case."""
-    kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
     name = drawn.kind.partition(":")[0]
+    entry = next((entry for entry in POINT_ENTRIES if entry.name == name), None)
+    if entry is not None:
+        values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
+        return {
+            "kind": name,
+            "diagnosis_names": [name, *ALSO_RIGHT.get(name, ())],
+            "parameters": values,
+            "sizes": [key.partition(".")[2] for key in drawn.sizes],
+            "units": {p.name: p.unit for p in entry.parameters if p.name in values},
+            "meaning": entry.equation,
+            "outside_library": False,
+            "near": list(entry.confusions),
+        }
+    kind = KINDS[drawn.kind] if drawn.kind in KINDS else OUTSIDE[drawn.kind]
     values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
     known = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
     units = {key: kind.units.get(key) or known.get(key) or known.get(f"{key[0]}0", "1") for key in values}

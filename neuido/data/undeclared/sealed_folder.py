@@ -21,6 +21,7 @@ from neuido.data.undeclared.guided_tracks import guided_case
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
 from neuido.errors import UserError
+from neuido.physics.effects.point_library import POINT_ENTRIES
 from neuido.physics.runtime.device import choose_device
 from neuido.physics.runtime.limits import check_limit
 
@@ -82,9 +83,10 @@ def _check(case: Case) -> None:
     if case.solver is not None and case.solver not in SOLVERS:
         raise UserError(f"solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
     if case.kind is not None and case.kind != "none" and case.measured != "guided":
+        known = (*KINDS, *OUTSIDE, *(entry.name for entry in POINT_ENTRIES if case.measured == "material_test"))
         for kind in case.kind.split("+"):
-            if kind not in KINDS and kind not in OUTSIDE:
-                raise UserError(f"kind = {kind!r} is unknown: choose from none, {', '.join((*KINDS, *OUTSIDE))}, or join two by +")
+            if kind not in known:
+                raise UserError(f"kind = {kind!r} is unknown: choose from none, {', '.join(known)}, or join two by +")
         kinds = case.kind.split("+")
         if len(kinds) > 2 or len(set(kinds)) < len(kinds) or (len(kinds) == 2 and any(k in OUTSIDE for k in kinds)):
             raise UserError(f"kind = {case.kind!r}: give one effect, or two different effects of the library")

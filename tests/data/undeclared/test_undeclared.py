@@ -261,6 +261,8 @@ def test_density_gradient_turns_a_thrown_body_about_another_centre():
 @pytest.mark.parametrize(
     ("measured", "kind", "read"),
     [
+        ("material_test", "mullins", read_material_tests),
+        ("material_test", "herschel_bulkley", read_material_tests),
         ("material_test", "second_invariant", read_material_tests),
         ("track", "magnus", read_tracks),
         ("guided", "spring:dry_friction", read_tracks),

@@ -12,6 +12,8 @@ from neuido.data.importers.tables.titled_tables import Table
 from neuido.errors import UserError
 
 PATHS = {"strain", "strain_1", "log_strain", "stretch", "stretch_1", "shear", "displacement", "displacement_1"}
+MOST_ROWS = 150
+"""Most rows of a creep test, which is computed row by row."""
 SMALL = 0.01
 """Largest shear of a creep test that is made from a compliance: in the linear range any size serves."""
 
@@ -64,8 +66,7 @@ def _sweep(given: MachineTable) -> Curve:
     moduli = [given.column(f"{kind}_modulus", "Pa", required=False) for kind in ("storage", "loss")]
     given.summary.append(f"a frequency sweep, in {'angular frequency' if angular else 'cycles per second'}: small oscillations in shear")
     kept = _positive(given, {"angular_frequency": omega, "storage_modulus": moduli[0], "loss_modulus": moduli[1]})
-    size = np.hypot(kept["storage_modulus"], kept["loss_modulus"])
-    return Curve(kept, {"mode": "oscillation"}, 3 * float(np.median(size)), given.summary)
+    return Curve(kept, {"mode": "oscillation"}, 3 * float(kept["storage_modulus"].min()), given.summary)  # what is left when all relaxed
 
 
 def _creep(given: MachineTable) -> Curve:
@@ -74,6 +75,7 @@ def _creep(given: MachineTable) -> Curve:
     kept = _positive(
         given, {"time": given.column("time", "s", required=False), "shear": given.column("compliance", "1/Pa", required=False)}
     )
+    kept = _evenly_in_logarithm(kept, given.summary)
     modulus, stress = 3 / float(np.median(kept["shear"])), float(f"{SMALL / kept['shear'].max():.3g}")
     shear = kept["shear"] * stress
     given.summary.append(
@@ -90,6 +92,17 @@ def _flow(given: MachineTable, stress: str) -> Curve:
     kept = _positive(given, {"shear_rate": rate, "shear_stress": seen})
     viscosity = float(np.exp(np.mean(np.log(kept["shear_stress"] / kept["shear_rate"]))))
     return Curve(kept, {"mode": "flow_curve"}, viscosity, given.summary)
+
+
+def _evenly_in_logarithm(columns: dict[str, np.ndarray], summary: list[str]) -> dict[str, np.ndarray]:
+    """Return at most `MOST_ROWS` rows, evenly spread in the logarithm of the time; a creep is a course over decades."""
+    time = columns["time"]
+    if len(time) <= MOST_ROWS:
+        return columns
+    place = np.floor((MOST_ROWS - 1) * np.log(time / time[0]) / np.log(time[-1] / time[0]))
+    _, rows = np.unique(place, return_index=True)
+    summary.append(f"{len(rows)} of {len(time)} rows are kept, evenly in the logarithm of the time")
+    return {key: values[rows] for key, values in columns.items()}
 
 
 def _positive(given: MachineTable, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

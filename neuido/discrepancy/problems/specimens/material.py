@@ -10,7 +10,7 @@ import torch
 
 from neuido.data.measured.material_test import CURVES, MaterialTest, MaterialTests, read_material_tests
 from neuido.discrepancy.problems.declared_model import declared
-from neuido.discrepancy.problems.problem import Parameter, Point, Problem, Recording
+from neuido.discrepancy.problems.problem import Point, Problem, Recording
 from neuido.discrepancy.problems.specimens.material_candidates import material_candidates
 from neuido.discrepancy.problems.specimens.repeats import noise_of, scatter, stiffness
 from neuido.errors import UserError
@@ -21,8 +21,6 @@ from neuido.physics.points.material_point import Specimen, complex_modulus, stra
 
 MOST_POINTS = 256
 """Largest number of parameter sets per batch."""
-FACTOR = "stiffness_factor"
-"""Name of the nuisance of a specimen that differs from others: a factor on its stress."""
 FAINT = 1e-3
 """Least predicted storage or loss modulus, relative to the smallest measured one: an elastic law has no loss, which has no logarithm."""
 UNLIKE = 1.25
@@ -47,24 +45,21 @@ class MaterialProblem(Problem):
         law = tests.model["flow"] if tests.fluid else tests.model["elasticity"] | tests.model["plasticity"]
         free = tuple(declared(name, law[name]) for name in tests.free if name != "density")
         chains = tests.histories()
-        size, groups, left = scatter(tests)
-        noises = [_noise_in(tests, next(chain for chain in chains if i in chain), i, left) for i in range(len(tests.tests))]
+        repeated = scatter(tests)
+        noises = [_noise_in(tests, next(chain for chain in chains if i in chain), i, repeated) for i in range(len(tests.tests))]
         candidates, fixed, excluded = material_candidates(tests)
-        varied = sorted({i for group in groups for i in group}) if size else []
         unit = tests.tests[0].unit
         super().__init__(
             name=tests.name,
             measure="rmse",
             unit=unit,
             declared=free,
-            nuisances=tuple(Parameter(f"{FACTOR}:{tests.tests[i].name}", "1", 1.0, size, 0.1, 10.0, log=True, prior=1.0) for i in varied),
+            nuisances=(),
             candidates=candidates,
             recordings=tuple(_recording(test, noise) for test, noise in zip(tests.tests, noises, strict=True)),
             labels={"kind": "material test"} | ({"excluded": excluded} if excluded else {}),
         )
         self.tests = tests
-        self.scatter = size
-        """Standard deviation of the logarithm of the stiffness from specimen to specimen, as repeats show it."""
         self._chains = chains
         self._fixed = fixed
         self._partners = {p.name: p.value for c in self.candidates for p in c.parameters} | fixed | tests.effects
@@ -79,13 +74,11 @@ class MaterialProblem(Problem):
         chain = next(chain for chain in self._chains if recording in chain)
         tests = [self.tests.tests[i] for i in chain[: chain.index(recording) + 1]]
         try:
-            out = self._along(points, tests)
+            return self._along(points, tests)
         except UserError:  # one parameter set that the law refuses fails the whole batch
             if len(points) == 1:
                 return np.full((1, n), np.nan)
             return np.concatenate([self.predict([point], recording) for point in points])
-        name = f"{FACTOR}:{tests[-1].name}"
-        return out * np.array([[float(point.get(name, 1.0))] for point in points])
 
     def _along(self, points: Sequence[Point], tests: Sequence[MaterialTest]) -> np.ndarray:
         """Return what the last of several tests of one specimen measures, for each parameter set."""
@@ -178,15 +171,15 @@ def _recording(test: MaterialTest, noise: float | None) -> Recording:
     return Recording(test.name, test.role, y, noise, groups, np.repeat(at, channels), "estimated" if test.noise is None else "stated")
 
 
-def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int, left: dict[int, float]) -> float | None:
+def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int, repeated: dict[int, float]) -> float | None:
     """Return the noise of test i; for a held-out test that continues a specimen, that of its fitted part on the same machine.
 
-    Repeats that differ by more than that beside a factor, `left`, say how well a test can be repeated.
+    Repeats that differ by more than that say how well a test can be repeated.
     """
     own = [tests.tests[i]]
     if tests.tests[i].role == "held_out" and tests.tests[i].noise is None:
         own = [tests.tests[j] for j in chain if tests.tests[j].role == "fit"][:1] + own
     found = next((noise for noise in map(noise_of, own) if noise is not None), None)
-    if tests.tests[i].noise is not None or i not in left:
+    if tests.tests[i].noise is not None or i not in repeated:
         return found
-    return max(found or 0.0, left[i])
+    return max(found or 0.0, repeated[i])

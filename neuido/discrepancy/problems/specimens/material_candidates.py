@@ -210,8 +210,14 @@ def _timed(c: _Collection, fits: Sequence[MaterialTest], strains: Sequence[np.nd
     if duration > 30 * shortest:
         most = 1e4 if not paths else 50.0
         names = [f"g{i}" for i in range(1, 6)]
-        c.add("relaxation_spectrum", [dict.fromkeys(names, 0.1)], *((g, 0.1, 0.0, most) for g in names), sizes=" ".join(names),
-              fixed={"first": shortest, "last": duration})  # fmt: skip
+        fixed = {"first": shortest, "last": duration}
+        if paths:
+            own = [(g, 0.1, 0.0, most) for g in names]
+            c.add("relaxation_spectrum", [dict.fromkeys(names, 0.1)], *own, sizes=" ".join(names), fixed=fixed)
+        else:  # moduli span decades, and so do the weights
+            falls = [dict(zip(names, np.geomspace(high, 1.0, 5), strict=True)) for high in (1.0, 30.0, 1e3)]
+            own = [(g, 0.5, 1e-3, most) for g in names]
+            c.add("relaxation_spectrum", falls, *own, sizes=" ".join(names), log=" ".join(names), linear=False, fixed=fixed)
         c.add("fractional", [{"ratio": 0.3, "exponent": a} for a in (0.15, 0.5)], ("ratio", 0.2, 0.0, most), ("exponent", 0.1, 0.03, 0.95),
               sizes="ratio", log="exponent", fixed={"time": float(np.sqrt(shortest * duration))})  # fmt: skip
     if tests.model["plasticity"]["law"] == "identity":

@@ -12,10 +12,8 @@ COMMON = 0.5
 """Share of its range that two tests must have in common to count as repeats."""
 SAME_PACE = 1.5
 """Ratio of the mean rates of two tests up to which they are repeats, and from which they show the rate."""
-COMPARED = 0.2
-"""Share of the largest stress from which the ratio of two repeats counts."""
-SCATTERS = 2e-3
-"""Least scatter of specimens that counts as one."""
+COMPARED = 50
+"""Strains at which repeats are compared."""
 RESTS = 0.2
 """Share of the fastest rate of a test below which it holds its strain."""
 STRAINED = 0.2
@@ -94,13 +92,10 @@ def _first_loading(test: MaterialTest) -> int:
     return max(first.stop or len(e), 1)
 
 
-def scatter(tests: MaterialTests) -> tuple[float, list[list[int]], dict[int, float]]:
-    """Estimate how much specimens differ, from repeats.
+def scatter(tests: MaterialTests) -> dict[int, float]:
+    """Estimate how much repeats differ: the standard deviation about their mean, in the unit of what was measured, of each of their tests.
 
-    Returns:
-        The standard deviation of the logarithm of the stiffness from specimen to specimen (0: none was seen); the groups of tests that are
-        repeats of each other; and for each of their tests what remains of the difference after that factor, a standard deviation in the
-        unit of what was measured.
+    Specimens of one material differ by some percent, and so does a machine from day to day; no effect explains that, and no fit is to.
     """
     chained = {i for chain in tests.histories() if len(chain) > 1 for i in chain}
     groups: list[list[int]] = []
@@ -109,23 +104,14 @@ def scatter(tests: MaterialTests) -> tuple[float, list[list[int]], dict[int, flo
             continue
         own = next((g for g in groups if are_repeats(tests.tests[g[0]], test)), None)
         groups.append([i]) if own is None else own.append(i)
-    groups = [g for g in groups if len(g) > 1]
-    ratios, left = [], {}
-    for group in groups:
+    found = {}
+    for group in (group for group in groups if len(group) > 1):
         curves = [_curve(tests.tests[i]) for i in group]
         low, high = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
-        at = np.linspace(low, high, 50)
+        at = np.linspace(low, high, COMPARED)
         values = np.stack([np.interp(at, *c) for c in curves])
-        mean = values.mean(axis=0)
-        seen = np.abs(mean) > COMPARED * np.abs(mean).max()
-        if seen.sum() < LEAST_ROWS or (values[:, seen] * mean[seen] <= 0).any():
-            continue
-        factors = values[:, seen] @ mean[seen] / (mean[seen] @ mean[seen])
-        ratios += list(np.log(factors) ** 2 * len(group) / (len(group) - 1))
-        rest = values - factors[:, None] * mean
-        left |= {i: float(np.sqrt(np.mean(rest**2) * len(group) / (len(group) - 1))) for i in group}
-    size = math.sqrt(float(np.mean(ratios))) if ratios else 0.0
-    return (size if size > SCATTERS else 0.0), groups, left
+        found |= dict.fromkeys(group, float(np.sqrt(np.mean(values.var(axis=0, ddof=1)))))
+    return found
 
 
 def _curve(test: MaterialTest) -> tuple[np.ndarray, np.ndarray]:

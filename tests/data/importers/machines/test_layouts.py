@@ -162,6 +162,10 @@ def test_a_compliance_is_creep_under_a_small_stress(tmp_path):
     (test,) = neuido.read_material_tests(tmp_path / "out").tests
     assert test.control == "stress" and test.mode == "simple_shear" and test.path.max() == pytest.approx(0.01, rel=0.01)
     np.testing.assert_allclose(test.path[:, 0] / test.stress[:, 0], 1e-5 * t**0.3, rtol=1e-5)
+    t = np.linspace(0.1, 1e3, 2000)
+    neuido.import_file(curve(tmp_path, "Time (s),Creep Compliance (1/Pa)", np.stack([t, 1e-5 * t**0.3], 1)), tmp_path / "long")
+    (long,) = neuido.read_material_tests(tmp_path / "long").tests
+    assert 70 < len(long.path) <= 150 and long.time[0] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("title", ["Shear stress (Pa)", "Viscosity (Pa s)"])
