@@ -5,7 +5,6 @@ the adapter is merged into the effective networks, so it adds no cost there.
 """
 
 import copy
-import hashlib
 import os
 import uuid
 from pathlib import Path
@@ -74,14 +73,10 @@ class LowRankAdaptation(Method):
         self.start, self.rank, self.alpha, self.lr, self.latent_lr, self.seed = start, rank, alpha, lr, latent_lr, seed
         self.prior_weight, self.plausibility_weight = prior_weight, plausibility_weight
         self.tuned: nn.Module = IntrinsicDynamicsOperator.load(operator).eval().requires_grad_(False)
-        self.fingerprint = fingerprint(self.tuned)
+        self.fingerprint = self.operator.fingerprint()
         if start == "encoder":
             encoder = DynamicsEncoder.load(init_from).requires_grad_(False)
-            given, wanted = encoder.projector.config["latent_dim"], self.operator.latent_dim
-            if given != wanted:
-                raise UserError(
-                    f"model.method.init_from = {init_from} gives latents of length {given}, but operator = {operator} takes {wanted}"
-                )
+            encoder.check_operator(self.operator, f"model.method.init_from = {init_from}")
             object.__setattr__(self, "encoder", encoder)  # shared by all scenes, not part of a checkpoint
         else:
             self._named_start()
@@ -227,11 +222,3 @@ def load_adapter(operator: IntrinsicDynamicsOperator, folder: Path) -> "PeftMode
         if type(error).__name__ != "SafetensorError":
             raise
         raise UserError(f"model.adapter: {folder / PEFT_FILES[1]} is not a safetensors file: {error}") from error
-
-
-def fingerprint(operator: nn.Module) -> str:
-    """Return the first twelve hexadecimal digits of the SHA-256 of the weights; an adapter only fits the weights it was trained on."""
-    digest = hashlib.sha256()
-    for name, tensor in sorted(operator.state_dict().items()):
-        digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:12]

@@ -148,7 +148,7 @@ def read_law(
         scene = load_visual_scene(recording, reconstruction=reconstruction, **options)
     own_operator = operator if isinstance(operator, IntrinsicDynamicsOperator) else IntrinsicDynamicsOperator.load(operator)
     own_encoder = encoder if isinstance(encoder, DynamicsEncoder) else DynamicsEncoder.load(encoder)
-    own_encoder.check_latents(own_operator.latent_dim, f"encoder = {encoder}" if isinstance(encoder, str) else "encoder")
+    own_encoder.check_operator(own_operator, f"encoder = {encoder}" if isinstance(encoder, str) else "encoder")
     own_operator, own_encoder = own_operator.to(chosen).eval(), own_encoder.to(chosen).eval()
     prepared = prepare(scene, own_encoder, device=chosen, encoder_views=encoder_views, cache=cache)
     return VideoLaw.infer(own_encoder, own_operator, prepared, repeat=1)

@@ -5,6 +5,7 @@ functions, and the law is their linear combination. As lambda is constant for a 
 trunk once, which is exact; a rollout then evaluates a small effective network (`neuido.physics.laws.neural.networks`).
 """
 
+import hashlib
 import json
 from collections import Counter
 from datetime import date
@@ -25,11 +26,15 @@ from neuido.physics.laws.neural.bounded import BoundedElastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 
 FORMAT = "neuido-operator/1"
+WEIGHTS = Path(__file__).parents[1] / "weights"
 PRETRAINED = {
-    "pretrained": Path(__file__).parents[1] / "weights" / "stage1.safetensors",
-    "pretrained-family": Path(__file__).parents[1] / "weights" / "stage1_family.safetensors",
-    "pretrained-bounded": Path(__file__).parents[1] / "weights" / "stage1_bounded.safetensors",
+    "pretrained": WEIGHTS / "stage1_bounded.safetensors",
+    "pretrained-bounded": WEIGHTS / "stage1_bounded.safetensors",
+    "pretrained-family": WEIGHTS / "stage1_family.safetensors",
+    "pretrained-objective": WEIGHTS / "stage1.safetensors",
 }
+"""The operators that come with neuido. `pretrained`, also named `pretrained-bounded`, has the right sign of the stress at every
+deformation; `pretrained-objective` is its predecessor."""
 ElasticNetwork = RawElastic | ObjectiveElastic
 PlasticNetwork = RawPlastic | ObjectivePlastic
 LAWS = {
@@ -201,6 +206,13 @@ class IntrinsicDynamicsOperator(nn.Module):
         elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
         return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))
 
+    def fingerprint(self) -> str:
+        """Return the first twelve hexadecimal digits of the SHA-256 of the weights: what is trained on them fits no others."""
+        digest = hashlib.sha256()
+        for name, tensor in sorted(self.state_dict().items()):
+            digest.update(name.encode() + tensor.detach().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:12]
+
     def save(self, path: str | Path, card: dict[str, Any] | None = None) -> None:
         """Write weights, latents and card to a safetensors file.
 
@@ -221,7 +233,7 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "pretrained") -> Self:
-        """Load an operator that ships with neuido (`pretrained`, `pretrained-family`, `pretrained-bounded`), or a file of `save`.
+        """Load an operator that ships with neuido (`pretrained`, `pretrained-family`, `pretrained-objective`), or a file of `save`.
 
         Raises:
             UserError: As in `load`.
@@ -232,8 +244,8 @@ class IntrinsicDynamicsOperator(nn.Module):
     def load(cls, path: str | Path = "pretrained") -> Self:
         """Load a file of `save`, or an operator that ships with the package.
 
-        The encoders are trained for `pretrained`. `pretrained-family` was trained with a prior that pulls the latents of a family together;
-        the elastic law of `pretrained-bounded` has the right sign at every deformation.
+        The elastic law of `pretrained` has the right sign at every deformation. `pretrained-objective` is its predecessor, without that.
+        `pretrained-family` was trained with a prior that pulls the latents of a family together; no encoder reads it.
 
         Raises:
             UserError: The file is missing, or it is not an operator.

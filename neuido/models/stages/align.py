@@ -287,4 +287,5 @@ class AlignModule(ImageModule):
 
     def on_train_end(self) -> None:
         names = [scene.name for scene in self.trainer.datamodule.scenes]
-        report_and_save(self, self.encoder.save, {"stage": "II", "steps": self.global_step, "scenes": names})
+        card = {"stage": "II", "operator": self.operator.fingerprint(), "steps": self.global_step, "scenes": names}
+        report_and_save(self, self.encoder.save, card)

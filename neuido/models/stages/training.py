@@ -56,7 +56,9 @@ def report_and_save(
         save(module.hparams.save_to, {**card, "figures": dict(figures)})
 
 
-def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **sizes) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
+def open_operator_and_encoder(
+    operator: str, init_from: str | None, vae: str, *, of_another: bool = False, **sizes
+) -> tuple[IntrinsicDynamicsOperator, DynamicsEncoder]:
     """Open a frozen operator, and an encoder that infers its latents.
 
     Args:
@@ -64,10 +66,11 @@ def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **
         init_from: File of `DynamicsEncoder.save`, or `pretrained`; it brings its own VAE and sizes. Without one, a new projector starts
             near the mean latent of Stage I.
         vae: VAE of a new encoder, as in `video_vae.open_vae`.
+        of_another: Whether the encoder may have been trained for another operator, as a start.
         sizes: Other options of a new `DynamicsEncoder`.
 
     Raises:
-        UserError: A file is missing, or the latents have different lengths.
+        UserError: A file is missing, or the encoder is not one for the operator.
     """
     frozen = IntrinsicDynamicsOperator.load(operator)
     frozen.eval().requires_grad_(False)
@@ -77,5 +80,5 @@ def open_operator_and_encoder(operator: str, init_from: str | None, vae: str, **
         encoder = DynamicsEncoder(vae, latent_dim=frozen.latent_dim, **sizes)
         if len(frozen.latents) > 1:
             encoder.projector.start_near(frozen.latents)
-    encoder.check_latents(frozen.latent_dim, f"model.init_from = {init_from}")
+    encoder.check_operator(frozen, f"model.init_from = {init_from}", weights=not of_another)
     return frozen, encoder

@@ -107,7 +107,7 @@ class WarmupModule(LightningModule):
         self.save_hyperparameters()
         flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale}
         sizes = {"width": width, "heads": heads, "conditions": conditions, "dropout": dropout}
-        self.operator, self.encoder = open_operator_and_encoder(operator, init_from, vae, **flow, **sizes)  # type: ignore[arg-type]
+        self.operator, self.encoder = open_operator_and_encoder(operator, init_from, vae, of_another=True, **flow, **sizes)  # type: ignore[arg-type]
         self._clips: dict[str, Tensor] = {}
         self._rows: list[tuple[LawErrors, Tensor, Tensor, Tensor]] = []
 
@@ -207,7 +207,7 @@ class WarmupModule(LightningModule):
         self.log_dict(values, prog_bar=True, sync_dist=True)
 
     def on_train_end(self) -> None:
-        report_and_save(self, self.encoder.save, {"stage": "warm-up", "steps": self.global_step})
+        report_and_save(self, self.encoder.save, {"stage": "warm-up", "operator": self.operator.fingerprint(), "steps": self.global_step})
 
 
 def _spearman(a: Tensor, b: Tensor) -> Tensor:

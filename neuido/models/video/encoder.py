@@ -19,14 +19,17 @@ from neuido.data.files.parsing import naming
 from neuido.data.files.values import mapping
 from neuido.data.weight_files import build
 from neuido.errors import UserError
+from neuido.models.operator.dynamics_operator import WEIGHTS, IntrinsicDynamicsOperator
 from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
 from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, read_weights, write_weights
 from neuido.models.video.video_vae import PREFIX, CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
 PRETRAINED = {
-    "pretrained": Path(__file__).parents[1] / "weights" / "stage2.safetensors",
-    "pretrained-small": Path(__file__).parents[1] / "weights" / "stage2_small.safetensors",
+    "pretrained": WEIGHTS / "stage2_bounded.safetensors",
+    "pretrained-small": WEIGHTS / "stage2_small_bounded.safetensors",
+    "pretrained-objective": WEIGHTS / "stage2.safetensors",
+    "pretrained-small-objective": WEIGHTS / "stage2_small.safetensors",
 }
 REFERENCE_INTERVAL, REFERENCE_CELL = 5e-3, 1e-2
 """Frame interval [s] and cell size [m] at which the two conditions of the projector are zero."""
@@ -184,19 +187,25 @@ class DynamicsEncoder(nn.Module):
         size = f"{flow['flow_size']} px flow, {flow['flow_encoding']}"
         return f"{type(self).__name__}(latent_dim={sizes['latent_dim']}, width={sizes['width']}, vae={vae}, {size})"
 
-    def check_latents(self, latent_dim: int, option: str) -> None:
-        """Check that the latents have the length that the operator needs.
+    def check_operator(self, operator: IntrinsicDynamicsOperator, option: str, *, weights: bool = True) -> None:
+        """Check that the latents have the operator's length, and were trained for its weights if the encoder's card says for which.
 
         Args:
-            latent_dim: Latent dimension of the operator.
+            operator: The operator, without an adapter.
             option: Name of the option that the error mentions.
+            weights: Whether to compare the weights too; a training that starts from an encoder of another operator does not.
 
         Raises:
-            UserError: The lengths differ.
+            UserError: The lengths differ, or the encoder was trained for other weights.
         """
         given = self.projector.config["latent_dim"]
-        if given != latent_dim:
-            raise UserError(f"{option} gives latents of length {given}, but the operator takes {latent_dim}: use an encoder trained for it")
+        if given != operator.latent_dim:
+            raise UserError(
+                f"{option} gives latents of length {given}, but the operator takes {operator.latent_dim}: use an encoder trained for it"
+            )
+        trained = self.card.get("operator")
+        if weights and trained is not None and trained != (own := operator.fingerprint()):
+            raise UserError(f"{option} was trained for operator {trained}, not for the given one, {own}: use two that belong together")
 
     def train(self, mode: bool = True) -> Self:
         """Set the training mode of all modules except the frozen VAE."""
@@ -255,6 +264,8 @@ class DynamicsEncoder(nn.Module):
     @classmethod
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
         """Load a file of `save`, or an encoder that ships with neuido: `pretrained`, or `pretrained-small` for few, coarse frames on a CPU.
+
+        `pretrained-objective` and `pretrained-small-objective` are their predecessors, for the operator `pretrained-objective`.
 
         Raises:
             UserError: The file is missing, or it is not an encoder.

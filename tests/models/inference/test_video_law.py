@@ -13,6 +13,7 @@ from neuido.models.inference.pipeline import infer_latent
 from neuido.models.inference.prepared_scene import prepare
 from neuido.models.operator.law_properties import p_wave_modulus, with_prefix
 from neuido.models.stages.align import AlignModule
+from neuido.models.stages.warmup import WarmupModule
 from tests.models.visual_samples import TinyScenes, tiny_scene
 
 
@@ -74,6 +75,22 @@ def test_latents_of_another_length_are_refused(operator, tmp_path):
         read_law(tiny_scene(tmp_path), operator=operator, encoder=other, device="cpu")
 
 
+@pytest.mark.parametrize(
+    ("encoder", "operator"), [("pretrained-small", "pretrained-objective"), ("pretrained-small-objective", "pretrained")]
+)
+def test_an_encoder_of_another_operator_is_refused(encoder, operator, tmp_path):
+    line = rf"encoder = {encoder} was trained for operator \w{{12}}, not for the given one, \w{{12}}: use two that belong together"
+    with pytest.raises(UserError, match=line):
+        read_law(tiny_scene(tmp_path), operator=operator, encoder=encoder, device="cpu")
+    WarmupModule(operator, init_from=encoder)  # but a training may start from it
+
+
+@pytest.mark.parametrize("names", [("pretrained", "pretrained-small"), ("pretrained-objective", "pretrained-small-objective")])
+def test_the_encoders_that_come_with_neuido_name_their_operator(names):
+    for name in names:
+        DynamicsEncoder.load(name).check_operator(Operator.load(names[0]), name)
+
+
 def test_a_law_without_a_scene_does_not_roll_out(operator):
     law = VideoLaw(operator, operator.latent("jelly"))
     with pytest.raises(ValueError, match="has no scene"):
@@ -100,6 +117,6 @@ def test_public_names_are_found_and_listed():
 
 
 def test_what_a_user_holds_shows_itself_in_one_line(operator, encoder):
-    assert repr(operator).startswith("IntrinsicDynamicsOperator(trunk='objective', latent_dim=128")
+    assert repr(operator).startswith("IntrinsicDynamicsOperator(trunk='bounded', latent_dim=128")
     assert "30 elastic" in repr(operator)
     assert repr(encoder).startswith("DynamicsEncoder(latent_dim=128") and "\n" not in repr(encoder)
