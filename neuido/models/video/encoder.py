@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor, nn
@@ -19,12 +19,12 @@ from neuido.data.files.parsing import naming
 from neuido.data.files.values import mapping
 from neuido.data.weight_files import build
 from neuido.errors import UserError
-from neuido.models.operator.dynamics_operator import WEIGHTS, IntrinsicDynamicsOperator
 from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
 from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, read_weights, write_weights
 from neuido.models.video.video_vae import PREFIX, CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
+WEIGHTS = Path(__file__).parents[1] / "weights"
 PRETRAINED = {
     "pretrained": WEIGHTS / "stage2_bounded.safetensors",
     "pretrained-small": WEIGHTS / "stage2_small_bounded.safetensors",
@@ -33,6 +33,16 @@ PRETRAINED = {
 }
 REFERENCE_INTERVAL, REFERENCE_CELL = 5e-3, 1e-2
 """Frame interval [s] and cell size [m] at which the two conditions of the projector are zero."""
+
+
+class ReadsLatents(Protocol):
+    """What an encoder must know of the operator that reads its latents."""
+
+    latent_dim: int
+
+    def fingerprint(self) -> str:
+        """Identify the operator's weights."""
+        ...
 
 
 class AttentionPool(nn.Module):
@@ -187,7 +197,7 @@ class DynamicsEncoder(nn.Module):
         size = f"{flow['flow_size']} px flow, {flow['flow_encoding']}"
         return f"{type(self).__name__}(latent_dim={sizes['latent_dim']}, width={sizes['width']}, vae={vae}, {size})"
 
-    def check_operator(self, operator: IntrinsicDynamicsOperator, option: str, *, weights: bool = True) -> None:
+    def check_operator(self, operator: ReadsLatents, option: str, *, weights: bool = True) -> None:
         """Check that the latents have the operator's length, and were trained for its weights if the encoder's card says for which.
 
         Args:
