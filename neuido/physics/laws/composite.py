@@ -185,8 +185,8 @@ def laws_of_bodies(bodies: Sequence[Body], order: Tensor) -> tuple[CompositeElas
         elastic += _parts(body, body.law, ElasticLaw, own, start, where)
         plastic += _parts(body, Identity() if body.plasticity is None else body.plasticity, PlasticLaw, own, start, where)
         start = end
-    yielding = CompositePlastic(_merged(plastic), order)
-    return CompositeElastic(_merged(elastic), order), None if yielding.identity else yielding
+    yielding = CompositePlastic(_merged(plastic, order.device), order)
+    return CompositeElastic(_merged(elastic, order.device), order), None if yielding.identity else yielding
 
 
 def _parts(body: Body, given: Any, kind: type, own: Tensor, start: int, where: str) -> list[Part]:
@@ -258,7 +258,7 @@ def _stacked(laws: Sequence[Any]) -> Any:
     return (StackedElastic if isinstance(laws[0], ElasticLaw) else StackedPlastic)(laws)
 
 
-def _merged(parts: list[Part]) -> list[Part]:
+def _merged(parts: list[Part], device: torch.device) -> list[Part]:
     """Join classical laws of neighbouring ranges to one part, so that they share a launch."""
     out: list[list[Part]] = []
     for part in parts:
@@ -267,13 +267,12 @@ def _merged(parts: list[Part]) -> list[Part]:
             out[-1].append(part)
         else:
             out.append([part])
-    return [group[0] if len(group) == 1 else _joined(group) for group in out]
+    return [group[0] if len(group) == 1 else _joined(group, device) for group in out]
 
 
-def _joined(parts: Sequence[Part]) -> Part:
-    """Return one part for classical laws of neighbouring ranges."""
+def _joined(parts: Sequence[Part], device: torch.device) -> Part:
+    """Return one part for classical laws of neighbouring ranges; its index lies on the device of the rollout."""
     indices, first = [], 0
-    device = next((part.index.device for part in parts if part.index is not None), None)
     for part in parts:
         assert isinstance(part.rows, slice)  # a classical law of a body has its whole range
         count = part.rows.stop - part.rows.start
