@@ -28,10 +28,15 @@ ANSWERS = {  # what each must print
     "10": r"Young's modulus read from the video: \d+ kPa, Poisson's ratio 0\.\d+",
     "11": r"lacks linear air drag",
     "12": "",
-    "14": r"d path / d friction -0\.\d+ m",
-    "15": r"the ball sinks to 0\.\d+ m and ends at x = 0\.\d+ m",
-    "16": r"3\d{3} particles of \d+ cm\^3; the skin comes down to -?\d+ mm",
-    "13": r"d force / d modulus [1-9]",
+    "13": r"d path / d friction -0\.\d+ m",
+    "14": r"the ball sinks to 0\.\d+ m and ends at x = 0\.\d+ m",
+    "15": r"slips 7\.\d+ cm, a rigid one 7\.35 cm\n.* with (6\.[7-9]|7\.[01])\d* N, friction times weight is 6\.89 N",
+    "16": r"d force / d modulus [1-9]",
+    "17": r"the period is 1\.2[2-7]\d s, that of a rigid pendulum 1\.250 s",
+    "18": r"2[45]\d\d particles of 3\d{3} cm\^3; the ground feels up to \d+ N",
+    "19": r"misses by 1\d\.\d+ cm\n(.*\n)+.*misses by 0\.[0-4]\d cm",
+    "20": r"found (3\.9|4|4\.0)\d*e\+04 Pa",
+    "21": r"100 % plasticine: mean height 1\d\.\d cm",
 }
 
 

@@ -3,7 +3,7 @@ A gripper that measures
 =======================
 
 Two plates close on a jelly and lift it. The force on each plate is read out, with its gradient with respect to the stiffness of the jelly.
-Run it with ``python examples/13_gripper.py``.
+Run it with ``python examples/16_gripper.py``.
 """
 
 import matplotlib.pyplot as plt
@@ -39,12 +39,12 @@ height = frames.x.detach()[..., 1].mean(1)
 print(f"the jelly was lifted by {100 * float(height[-1] - height[0]):.1f} cm")
 
 # %%
-plt.figure(figsize=(5, 3))
+plt.figure(figsize=(7.6, 3))
 for c, name in enumerate(("left", "right")):
     plt.plot(frames.times, frames.forces[:, c, 0].detach(), label=f"{name} plate, sideways")
 plt.plot(frames.times, -frames.forces[:, 2, 1].detach(), label="table, downwards")
 plt.xlabel("time [s]")
 plt.ylabel("force [N]")
-plt.legend(frameon=False)
+plt.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 plt.tight_layout()
 plt.savefig("gripper.png")

@@ -3,7 +3,7 @@ Rubber and sand
 ===============
 
 A rubber ball falls on a heap of sand and bounces off a block of wood: three bodies with three laws in one scene.
-Run it with ``python examples/15_rubber_and_sand.py``.
+Run it with ``python examples/14_rubber_and_sand.py``.
 """
 
 import matplotlib.pyplot as plt
@@ -12,14 +12,14 @@ import torch
 from neuido import Body, Scene, Simulator, laws, shapes
 
 sand = Body(
-    shape=shapes.box(lower=(0.1, 0.06, 0.15), upper=(0.55, 0.2, 0.45), spacing=0.025),
+    shape=shapes.box(lower=(0.1, 0.0, 0.15), upper=(0.55, 0.15, 0.45), spacing=0.025),
     name="sand",
     law=laws.Sigma(2e5, 0.3),
     plasticity=laws.DruckerPrager(30.0, 2e5, 0.3),
     density=1600.0,
 )
 wood = Body(
-    shape=shapes.box(lower=(0.65, 0.06, 0.2), upper=(0.85, 0.25, 0.4), spacing=0.025),
+    shape=shapes.box(lower=(0.65, 0.0, 0.2), upper=(0.85, 0.2, 0.4), spacing=0.025),
     name="wood",
     law=laws.FixedCorotated(4e5, 0.2),
     density=600.0,
@@ -32,7 +32,7 @@ rubber = Body(
     velocity=(0.8, -1.5, 0.0),
 )
 friction = [("rubber", "sand", 0.5), ("rubber", "wood", 0.3), ("sand", "wood", 0.4)]
-scene = Scene(cells=24, dt=6e-4, upper=(1.0, 0.6, 0.6), bodies=[sand, wood, rubber], body_friction=friction)
+scene = Scene(cells=20, dt=6e-4, upper=(1.0, 0.6, 0.6), bodies=[sand, wood, rubber], body_friction=friction)
 with torch.no_grad():
     frames = Simulator(scene, device="cpu").rollout(600, every=50)
 ball = frames.x[:, frames.body == 2].mean(1)
