@@ -91,7 +91,7 @@ def test_arrays_that_say_too_little_are_refused(data, options, word):
     ],
 )
 def test_candidates_that_say_too_little_are_refused(changed, word):
-    given = {"name": "lift", "parameter": "jerk", "unit": "1", "start": 1.0, "low": -2.0, "high": 2.0, "acts_as": ramp} | changed
+    given = {"name": "rising_lift", "parameter": "jerk", "unit": "1", "start": 1.0, "low": -2.0, "high": 2.0, "acts_as": ramp} | changed
     with pytest.raises(UserError, match=word):
         OwnEffect(**given).candidate()
 

@@ -40,7 +40,7 @@ def test_read(folder):
         "uniform_acceleration.y": 0,
         "uniform_acceleration.z": 0,
     }
-    assert tracks.nuisances == {"release_time": 0.1, "length_scale": 0.03, "time_base": 0.0}
+    assert tracks.nuisances == {"release_time": 0.1, "length_scale": 0.03, "time_base": 0.0, "spin": 0.2, "attitude": 0.3}
     assert tracks.bodies == {"golf": {"mass": 0.0459, "diameter": 0.0439}, "stone": {}}
     one, two, three = tracks.recordings
     assert tracks.of("fit") == (one, three) and tracks.of("held_out", "golf") == (two,) and tracks.of("held_out", "stone") == ()
