@@ -11,7 +11,7 @@ FRAME_RATE = 24.0
 """Frames a second of a video by default: that of films."""
 
 
-def render(
+def render_path(
     path: str,
     *,
     out: str,

@@ -3,7 +3,7 @@
 HOST, PORT = "localhost", 8080
 
 
-def view(
+def view_path(
     path: str,
     *,
     recording: str | None = None,

@@ -38,7 +38,8 @@ def little(monkeypatch):
 
 def test_grid():
     with pytest.raises(
-        UserError, match=r"1 scene, 125 particles and 1000\d+ x .* grid nodes a scene needs about .* PB of memory, .* lower `cells` .*`grid='window'`"
+        UserError,
+        match=r"1 scene, 125 particles and 1000\d+ x .* grid nodes a scene needs about .* PB of memory, .* lower `cells` .*`grid='window'`",
     ) as error:
         Simulator(scene(10**6), body(), device="cpu", grid="domain")
     assert limits.MEMORY in str(error.value)
