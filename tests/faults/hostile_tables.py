@@ -191,10 +191,15 @@ def choices() -> Iterator[Hostile]:
 
 
 def curves() -> Iterator[Hostile]:
-    for titles in ("Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)", "Time (s),Compliance (1/Pa)",
-            "Shear rate (1/s),Shear stress (Pa)",
-                   "Shear rate (1/s),Viscosity (Pa s)", "Time (s),Angle (deg)", "Time (s),Theta (rad)"):  # fmt: skip
-        rows = [",".join(f"{(i + 1) * (j + 1)}" for j in range(titles.count(",") + 1)) for i in range(9)]
+    for titles, sign in (
+        ("Frequency (Hz),Storage modulus (Pa),Loss modulus (Pa)", -1),
+        ("Time (s),Compliance (1/Pa)", -1),
+        ("Shear rate (1/s),Shear stress (Pa)", -1),
+        ("Shear rate (1/s),Viscosity (Pa s)", -1),
+        ("Time (s),Angle (deg)", 1),
+        ("Time (s),Theta (rad)", 1),
+    ):
+        rows = [",".join(f"{sign * (i + 1) * (j + 1)}" for j in range(titles.count(",") + 1)) for i in range(9)]
         yield text("curve", titles, [titles, *rows])
 
 

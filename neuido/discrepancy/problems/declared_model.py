@@ -123,18 +123,11 @@ def laws_of(model: Mapping[str, Any], points: Sequence[Mapping[str, float]]) -> 
 
     if "law" in model:
         elastic, plastic = _load(model["law"]["file"])
-        return scaled(elastic, values(model["law"], "stiffness")), plastic
+        return elastic.scaled(values(model["law"], "stiffness")), plastic
     parts = []
     for part in (model["elasticity"], model["plasticity"]):
         parts.append({key: value if key == "law" else values(part, key) for key, value in part.items()})
     return material(*parts)
-
-
-def scaled(law: Any, factor: Tensor) -> Any:
-    """Return a neural elastic law with its stress times a factor per scene (S,); exact, because its last layer is linear."""
-    W1, b1, W2, b2, W3, b3 = law.tensors()
-    factor = factor.to(W3)
-    return type(law)(W1, b1, W2, b2, factor[:, None, None] * W3, factor[:, None] * b3, scale=law.scale)
 
 
 def classical(experiment: Experiment) -> Experiment:

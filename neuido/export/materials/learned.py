@@ -56,9 +56,7 @@ def _read(path: Path) -> tuple[Any, Any]:
     checked, _ = read_declared_model(model, folder=file.resolve().parent)
     laws: tuple[Any, Any] = load_law(checked["law"]["file"])
     elastic, plastic = laws
-    factor = checked["law"]["stiffness"]
-    W1, b1, W2, b2, W3, b3 = elastic.tensors()
-    return type(elastic)(W1, b1, W2, b2, factor * W3, factor * b3, scale=elastic.scale), plastic
+    return elastic.scaled(torch.tensor([float(checked["law"]["stiffness"])])), plastic
 
 
 class LawModule(nn.Module):

@@ -10,7 +10,7 @@ import yaml
 
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.problems.body import body_problem
-from neuido.discrepancy.problems.declared_model import classical, laws_of, ready, scaled, with_law
+from neuido.discrepancy.problems.declared_model import classical, laws_of, ready, with_law
 from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.mpm.simulator import Simulator
@@ -35,15 +35,17 @@ def folder(law, tmp_path_factory) -> Path:
     """A block of that law, 0.7 times as stiff, with drag."""
     path = tmp_path_factory.mktemp("neural") / "block"
     elastic, plastic = load_law(law)
-    made.experiment(path, DRAG, frames=12, side=4, noise=2e-4, laws=(scaled(elastic, torch.tensor([FACTOR])), plastic))
+    made.experiment(path, DRAG, frames=12, side=4, noise=2e-4, laws=(elastic.scaled(torch.tensor([FACTOR])), plastic))
     return path
 
 
-def test_scaled_law_has_the_scaled_stress(law):
-    elastic, _ = load_law(law)
+@pytest.mark.parametrize("weights", ["pretrained", "pretrained-objective"])
+def test_scaled_law_has_the_scaled_stress(weights):
+    operator = IntrinsicDynamicsOperator.load(weights)
+    elastic, _ = operator.laws(operator.latent("jelly").detach())
     F = torch.eye(3) + 0.1 * torch.randn(5, 3, 3, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(scaled(elastic, torch.tensor([FACTOR]))(F), FACTOR * elastic(F), rtol=1e-4, atol=1e-2)
-    assert float(scaled(elastic, torch.tensor([1.0, 2.0])).modulus()[1]) == pytest.approx(2 * float(elastic.modulus()), rel=1e-5)
+    torch.testing.assert_close(elastic.scaled(torch.tensor([FACTOR]))(F), FACTOR * elastic(F), rtol=1e-4, atol=1e-2)
+    assert float(elastic.scaled(torch.tensor([1.0, 2.0])).modulus()[1]) == pytest.approx(2 * float(elastic.modulus()), rel=1e-5)
 
 
 def test_typical_sizes_are_those_of_the_law(law, folder):

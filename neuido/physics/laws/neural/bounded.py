@@ -3,6 +3,8 @@
 In the fused kernels of `fused`, and by the kernels of `bounded_kernels` elsewhere; `bounded_stress` is the same in plain torch.
 """
 
+from typing import Self
+
 import torch
 from torch import Tensor
 
@@ -85,3 +87,10 @@ class BoundedElastic(ObjectiveElastic):
     kernels = staticmethod(kernels)
     features_of = staticmethod(bounded_features)
     stress_of = staticmethod(bounded_stress)
+
+    def scaled(self, factor: Tensor) -> Self:
+        """Return this law with its stress times a factor per scene (S,); exact, because both moduli are exponentials of outputs."""
+        *hidden, W3, b3 = self.weights
+        shift = torch.zeros(len(factor), self.outputs, dtype=b3.dtype, device=b3.device)
+        shift[:, :2] = factor.to(b3).log()[:, None]
+        return type(self)(*hidden, W3.expand(len(factor), -1, -1), b3 + shift, scale=self.scale)

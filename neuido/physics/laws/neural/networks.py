@@ -14,6 +14,7 @@ activations. Calling a law evaluates it in plain torch, which autograd different
 
 import threading
 from collections.abc import Hashable, Sequence
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -227,6 +228,12 @@ class _Network(Law):
     def tensors(self) -> tuple[Tensor, ...]:
         """Return W1, b1, W2, b2, W3 and b3."""
         return self.weights
+
+    def scaled(self, factor: Tensor) -> Self:
+        """Return this law with its outputs (of an elastic law, the stress) times a factor per scene, (S,); the last layer is linear."""
+        *hidden, W3, b3 = self.weights
+        factor = factor.to(W3)
+        return type(self)(*hidden, factor[:, None, None] * W3, factor[:, None] * b3, scale=self.scale)
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
         """Return an engine with fused kernels where they exist (CUDA, float32, some widths), else the general one."""
