@@ -164,8 +164,8 @@ def _plain(path: Path, columns: dict[str, str]) -> Motion:
     clock = next((name for name in ("time", "frame") if name in found), None)
     if not axes and "angle" in found:
         raise UserError(
-            f"{path.name} has the angle of a body on a pivot, which `neuido import` does not read: write a folder with constraint: pendulum "
-            "(docs/formats/track.md), or give x and y of the bob by --columns.x and --columns.y"
+            f"{path.name} has the angle of a body on a pivot, which `neuido import` does not read: write a folder with "
+            "constraint: pendulum (docs/formats/track.md), or give x and y of the bob by --columns.x and --columns.y"
         )
     if not axes or clock is None:
         titles = ", ".join(filter(None, table.titles))
