@@ -204,7 +204,7 @@ def api_pages() -> dict[str, str]:
                 directive(getattr(value, n), f"{value.__name__}.{n}") for n in own
             )
         elif inspect.ismodule(value):
-            body = directive(value.__call__, f"{value.__name__}.particles.export")
+            body = directive(value.__call__, f"{value.__name__}.exporting.export")
         else:
             body = directive(value, f"neuido.{name}")
         example = f"## Example\n\n```python\n{EXAMPLES[name].strip()}\n```\n\n## Reference\n\n" if name in EXAMPLES else ""
