@@ -96,7 +96,8 @@ class Motion:
         if self.x.shape[1] <= RELIEF_NEIGHBOURS or not self.spacing:
             return colours
         outwards = (x - x[self._neighbours].mean(axis=1)) @ SKY.astype(x.dtype) / self.spacing
-        light = RELIEF * np.clip(np.nan_to_num(outwards), -1.0, 1.0)[:, None]
+        outwards = np.where(np.isfinite(outwards), outwards, 0.0)  # a particle without a place is not drawn
+        light = RELIEF * np.clip(outwards, -1.0, 1.0)[:, None]
         return np.clip(colours * (1.0 + light) + GLOSS * light, 0, 255).astype(np.uint8)
 
     @cached_property

@@ -15,6 +15,8 @@ NEIGHBOURS = 12
 """Nearest particles from which the total deformation gradient is estimated; about the first shell of a lattice."""
 COLLAPSED = 1e-6
 """Squared stretch below which matter counts as collapsed [-]; its logarithm is that of this number."""
+GREY = 150
+"""Each channel of the colour of particles whose value is not known."""
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"))
 
 
@@ -51,11 +53,13 @@ class Quantity:
         return (low, high) if high > low else (low, low + 1.0)
 
     def colours(self, frame: int) -> np.ndarray:
-        """Return the colour of each particle, (P, 3) uint8."""
+        """Return the colour of each particle, (P, 3) uint8; grey where the value is not a number."""
         low, high = self.range
-        with np.errstate(invalid="ignore"):
-            place = np.nan_to_num((np.asarray(self.values(frame), float) - low) / (high - low), nan=0.0)
-        return table(self.around is not None)[(255 * np.clip(place, 0.0, 1.0)).astype(np.uint8)]
+        values = np.asarray(self.values(frame), float)
+        known = ~np.isnan(values)
+        place = np.clip((np.where(known, values, low) - low) / (high - low), 0.0, 1.0)
+        colours = table(self.around is not None)[(255 * place).astype(np.uint8)]
+        return np.where(known[:, None], colours, np.uint8(GREY))
 
     @property
     def scaled(self) -> tuple[float, str]:

@@ -56,6 +56,8 @@ def test_points_that_were_not_seen_have_a_colour_and_no_say_in_the_range():
     assert one.range[0] == 0.0 and 1.9 < one.range[1] <= 2.0
     assert one.colours(0).shape == (4, 3)
     assert not (one.colours(0)[0] == one.colours(0)[3]).all()
+    assert len(set(one.colours(0)[2])) == 1  # grey, and no colour of the legend
+    assert not (one.colours(0)[2] == one.colours(0)).all(axis=1)[[0, 1, 3]].any()
 
 
 def test_legend_has_readable_units():
