@@ -91,13 +91,12 @@ class Window:
             high: Largest coordinates [m], (S, 3).
             margin: Cells between the particles and the edge, at least.
         """
-        seen = torch.isfinite(low).all(dim=1) & torch.isfinite(high).all(dim=1)
-        first = torch.where(
-            seen[:, None], ((low - self.edge) / self.dx - 0.5).floor().nan_to_num(0.0, 0.0, 0.0).long() - margin, self.first
-        )
-        last = ((high - self.edge) / self.dx - 0.5).floor().nan_to_num(0.0, 0.0, 0.0).long() + 2 + margin
-        first = first.clamp(min=0)
-        last = torch.where(seen[:, None], torch.minimum(last, self.whole - 1), first)
+        seen = (torch.isfinite(low) & torch.isfinite(high)).all(dim=1, keepdim=True)
+        # a scene without a finite particle keeps its place, of one node
+        low, high = (torch.where(seen, corner, self.edge) for corner in (low, high))
+        first = torch.where(seen, ((low - self.edge) / self.dx - 0.5).floor().long() - margin, self.first).clamp(min=0)
+        last = ((high - self.edge) / self.dx - 0.5).floor().long() + 2 + margin
+        last = torch.where(seen, torch.minimum(last, self.whole - 1), first)
         needed = (last - first + 1).amax(dim=0)
         rounded = (needed + ROUNDING - 1) // ROUNDING * ROUNDING
         self.shape = torch.minimum(torch.where(needed > self.shape, rounded, self.shape), self.whole.amax(dim=0))
