@@ -1,6 +1,5 @@
 """Read a run that is to be exported: frames of a simulation, a prediction or a diagnosis. The files are not trusted."""
 
-import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -9,19 +8,12 @@ import numpy as np
 import torch
 
 from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
+from neuido.data.formats.frame_files import LAW, SCENE, numbered_files, picked, read_frame_arrays, read_surfaces
 from neuido.data.formats.ply import read_ply_vertices
-from neuido.errors import UserError, suggest
+from neuido.errors import UserError
 from neuido.types import Scene, Skin
 
 KINDS = "a folder of `neuido simulate`, `neuido predict` or `neuido diagnose`, or a file of frames (.npz)"
-SCENE, LAW = "scene.yaml", "law.safetensors"
-"""Files beside the frames of a simulation: its scene with the model, and a learned law."""
-
-
-SURFACES = {"skin": ("vertices", "faces", "indices", "weights"), "collider": ("vertices", "faces", "poses")}
-"""Arrays of each skin and collider in a file of frames, as `Frames.save` names them."""
-MOST_SURFACES = 64
-"""Skins, and colliders, of a file that are read."""
 
 
 class Run(NamedTuple):
@@ -83,16 +75,8 @@ def elastic_law(path: Path) -> Any:
 
 
 def _frames(path: Path, frame_interval: float | None) -> Run:
-    kept = [f"{kind}_{i}_{part}" for kind, parts in SURFACES.items() for i in range(MOST_SURFACES) for part in parts]
-    optional = ("v", "C", "F", "times", "scene", "body", "body_names", *kept)
-    arrays = read_arrays(path, ("x",), optional, what="file of frames with positions x")
-    x = arrays["x"]
-    if x.ndim != 3 or x.shape[-1] != 3 or not x.size or x.dtype.kind != "f":
-        raise UserError(f"{path}: x has the shape {x.shape} of {x.dtype}; frames of particles are numbers (K, P, 3)")
-    for name, shape in (("v", x.shape), ("F", (*x.shape, 3)), ("C", (*x.shape, 3)), ("body", x.shape[1:2]), ("scene", x.shape[1:2])):
-        if name in arrays and arrays[name].shape != shape:
-            raise UserError(f"{path}: {name} has the shape {arrays[name].shape}; with x {x.shape} it must be {shape}")
-    times = arrays.get("times")
+    arrays = read_frame_arrays(path)
+    x, times = arrays["x"], arrays.get("times", arrays.get("t"))
     if times is not None and times.shape != (len(x),):
         raise UserError(f"{path}: times have the shape {times.shape} for {len(x)} frames of one scene: export each scene of its own")
     times = _times(times, len(x), frame_interval, path)
@@ -101,41 +85,16 @@ def _frames(path: Path, frame_interval: float | None) -> Run:
         own["body"] = arrays["scene"]
     if "body_names" in arrays:
         own["body_names"] = tuple(str(name) for name in arrays["body_names"])
-    skins, colliders = _surfaces(arrays, x.shape[1], path)
+    bound, moved = read_surfaces(arrays, path)
+    skins = tuple(Skin(**{part: torch.from_numpy(np.ascontiguousarray(values)) for part, values in each.items()}) for each in bound)
+    colliders = tuple(
+        SimpleNamespace(name=f"collider_{i}", mesh=SimpleNamespace(vertices=each["vertices"], faces=each["faces"]), poses=each["poses"])
+        for i, each in enumerate(moved)
+    )
     v = arrays["v"] if "v" in arrays else _velocities(x, times)
     motion = SimpleNamespace(x=x, v=v, times=times, skins=skins, colliders=colliders, **own)
     scene, law = _beside(path.parent)
     return Run(motion, path.parent.name if path.name == "frames.npz" else path.stem, scene, law)
-
-
-def _surfaces(arrays: dict[str, np.ndarray], particles: int, path: Path) -> tuple[tuple[Skin, ...], tuple[SimpleNamespace, ...]]:
-    """Return the skins and colliders of a file of frames (`Frames.save`)."""
-    skins, colliders = [], []
-    for kind, parts in SURFACES.items():
-        for i in range(MOST_SURFACES):
-            found = {part: arrays[f"{kind}_{i}_{part}"] for part in parts if f"{kind}_{i}_{part}" in arrays}
-            if not found:
-                continue
-            corners = found.get("vertices", np.empty(0))
-            whole = len(found) == len(parts) and corners.ndim == 2 and corners.shape[1] == 3
-            if not whole or not _within(found["faces"], len(corners)) or found["faces"].shape[1:] != (3,):
-                raise UserError(f"{path}: {kind} {i} is not whole, or its triangles name vertices that are not there")
-            if kind == "skin":
-                if found["weights"].shape != found["indices"].shape or len(found["indices"]) != len(corners):
-                    raise UserError(f"{path}: skin {i} has {found['indices'].shape} indices and {found['weights'].shape} weights")
-                if not _within(found["indices"], particles):
-                    raise UserError(f"{path}: skin {i} is bound to particles that are not there")
-                skins.append(Skin(**{part: torch.from_numpy(np.ascontiguousarray(values)) for part, values in found.items()}))
-            else:
-                if found["poses"].shape[1:] != (4, 4) or not np.isfinite(found["poses"]).all():
-                    raise UserError(f"{path}: collider {i} has poses of shape {found['poses'].shape}; needed (K, 4, 4)")
-                mesh = SimpleNamespace(vertices=corners, faces=found["faces"])
-                colliders.append(SimpleNamespace(name=f"collider_{i}", mesh=mesh, poses=found["poses"]))
-    return tuple(skins), tuple(colliders)
-
-
-def _within(indices: np.ndarray, count: int) -> bool:
-    return indices.ndim == 2 and indices.dtype.kind in "iu" and bool(((indices >= 0) & (indices < count)).all())
 
 
 def _times(given: np.ndarray | None, frames: int, interval: float | None, place: Path) -> np.ndarray:
@@ -166,22 +125,17 @@ def _beside(folder: Path) -> tuple[Scene | None, Any]:
     return scene, elastic_law(file) if file.name == LAW or "model" in content else None
 
 
-def _numbered(folder: Path) -> list[Path]:
-    found = [(int(match[1]), path) for path in folder.glob("*.ply") if (match := re.search(r"(\d+)$", path.stem))]
-    return [path for _, path in sorted(found)]
-
-
 def _prediction(folder: Path, recording: str | None, interval: float | None) -> Run:
     """Read the PLY files of particles that `neuido predict` wrote, of one scene."""
     notes: tuple[str, ...] = ()
-    own = next((each for each in (folder / "particles", folder) if each.is_dir() and _numbered(each)), None)
+    own = next((each for each in (folder / "particles", folder) if each.is_dir() and numbered_files(each)), None)
     if own is None:
-        names = sorted(path.parent.name for path in folder.glob("*/particles") if _numbered(path))
+        names = sorted(path.parent.name for path in folder.glob("*/particles") if numbered_files(path))
         if not names:
             raise UserError(f"{folder} holds no motion: give {KINDS}")
-        own = folder / _picked(names, recording, folder) / "particles"
+        own = folder / picked(names, recording, folder) / "particles"
         notes = _others(names, recording)
-    paths = _numbered(own)
+    paths = numbered_files(own)
     tables = [read_ply_vertices(path) for path in paths]
     if len({len(table) for table in tables}) > 1:
         raise UserError(f"{own}: the files have different numbers of particles: give a folder of one motion")
@@ -199,12 +153,6 @@ def _prediction(folder: Path, recording: str | None, interval: float | None) -> 
     return Run(SimpleNamespace(x=x, v=v, times=times), own.parent.name, notes=notes)
 
 
-def _picked(names: list[str], wanted: str | None, place: Path) -> str:
-    if wanted is not None and wanted not in names:
-        raise UserError(f"recording = {wanted!r} is not in {place}{suggest(wanted, names) or ';'} it has {', '.join(names)}")
-    return names[0] if wanted is None else wanted
-
-
 def _others(names: list[str], wanted: str | None) -> tuple[str, ...]:
     return (f"one of {len(names)}: --recording chooses from {', '.join(names)}",) if len(names) > 1 and wanted is None else ()
 
@@ -218,7 +166,7 @@ def _diagnosis(folder: Path, recording: str | None, when: str) -> Run:
             found[path.stem] = arrays
     if not found:
         raise UserError(f"{folder} is a diagnosis without a motion in space: --to abaqus|ansys|febio|mujoco exports its law")
-    chosen = _picked(list(found), recording, folder)
+    chosen = picked(list(found), recording, folder)
     arrays = found[chosen]
     if when not in arrays:
         raise UserError(

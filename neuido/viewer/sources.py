@@ -1,6 +1,5 @@
 """Read whatever can be viewed: rollouts, runs, experiments, recordings, diagnoses and Gaussian scenes. The files are not trusted."""
 
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,20 +8,15 @@ import numpy as np
 
 from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
 from neuido.data.files.values import vector
+from neuido.data.formats.frame_files import LAW, SCENE, numbered_files, picked, read_frame_arrays, read_surfaces
 from neuido.data.formats.ply import read_ply_header, read_ply_vertices
-from neuido.errors import UserError, suggest
+from neuido.errors import UserError
 from neuido.types import Gaussians, Plane, Scene
 from neuido.viewer.content import Content, Motion, moved_surface, place_side_by_side, skin_surface, with_scene
 from neuido.viewer.quantities import stress_by_body, stress_of
 
 RATE = 20.0
 """Frames a second at which motions without times are played: that of the videos of `neuido predict`."""
-SCENE, LAW = "scene.yaml", "law.safetensors"
-"""Names under which `neuido simulate` keeps the scene and a learned law beside the motion."""
-PARTS = {"skin": ("faces", "indices", "weights"), "collider": ("vertices", "faces", "poses")}
-"""Arrays of each skin and collider in a file of frames, as in `Frames.save`."""
-MOST_SURFACES = 64
-"""Skins, and colliders, of a file that are shown at most."""
 KINDS = (
     "a rollout (.npz), a folder of `neuido simulate`, `neuido predict` or `neuido diagnose`, an experiment, a recording, PLY files of "
     "particles or Gaussians, or a scene file (.yaml)"
@@ -76,40 +70,23 @@ def _of_folder(folder: Path) -> Reader:
         ("diagnosis.json", _diagnosis),
         ("frames.npz", lambda place, recording: _archive(place / "frames.npz", recording)),
         ("experiment.yaml", _experiment),
-        ("particles", lambda place, _: _ply_series(_numbered(place / "particles"))),
+        ("particles", lambda place, _: _ply_series(numbered_files(place / "particles"))),
     )
     for name, reader in marks:
         if (folder / name).exists():
             return reader
-    if _numbered(folder):
-        return lambda place, _: _ply_series(_numbered(place))
+    if numbered_files(folder):
+        return lambda place, _: _ply_series(numbered_files(place))
     if list(folder.glob("*/particles/*.ply")):
         return _predictions
     return _multiview
 
 
-def _pick(names: Sequence[str], wanted: str | None, place: Path) -> str:
-    """Return the wanted name of several, or the first."""
-    if wanted is None:
-        return names[0]
-    if wanted not in names:
-        raise UserError(f"recording = {wanted!r} is not in {place}{suggest(wanted, names) or ';'} it has {', '.join(names)}")
-    return wanted
-
-
 def _archive(path: Path, recording: str | None) -> Content:
     """Read an .npz file of frames, with the scene and the law that lie beside it."""
-    kept = [f"{kind}_{i}_{part}" for kind, parts in PARTS.items() for i in range(MOST_SURFACES) for part in parts]
-    arrays = read_arrays(path, ("x",), ("v", "F", "times", "t", "scene", "body", *kept), what="file of frames with positions x")
+    arrays = read_frame_arrays(path)
     x = arrays["x"]
-    if x.ndim == 2:
-        x = x[None]
-    if x.ndim != 3 or x.shape[-1] != 3 or not x.size or x.dtype.kind != "f":
-        raise UserError(f"{path}: x has the shape {arrays['x'].shape} of {x.dtype}; frames of particles are numbers (K, P, 3)")
-    frames, points = x.shape[:2]
-    for name, shape in (("v", (frames, points, 3)), ("F", (frames, points, 3, 3)), ("scene", (points,)), ("body", (points,))):
-        if name in arrays and arrays[name].shape != shape:
-            raise UserError(f"{path}: {name} has the shape {arrays[name].shape}; with x {x.shape} it must be {shape}")
+    frames = len(x)
     given = arrays.get("times", arrays.get("t"))
     times, timed = _times(given if given is None or given.ndim == 1 else given[0], frames, path)
     scene, laws = _beside(path.parent)
@@ -130,33 +107,13 @@ def _archive(path: Path, recording: str | None) -> Content:
 
 def _add_surfaces(content: Content, arrays: dict[str, np.ndarray], path: Path) -> None:
     """Add the skins and colliders that a file of frames has."""
-    motion, colliders, skins = content.motions[0], [], []
-    for i in range(MOST_SURFACES):
-        found = {kind: [arrays.get(f"{kind}_{i}_{part}") for part in parts] for kind, parts in PARTS.items()}
-        for kind, parts in found.items():
-            given = [part for part in parts if part is not None]
-            if given and len(given) < len(parts):
-                raise UserError(f"{path}: {kind} {i} is not whole; it takes {', '.join(f'{kind}_{i}_{part}' for part in PARTS[kind])}")
-        if found["skin"][0] is not None:
-            faces, indices, weights = found["skin"]
-            bound = indices.ndim == weights.ndim == 2 and indices.shape == weights.shape and _within(indices, motion.x.shape[1])
-            if not bound or not _triangles(faces, len(indices)):
-                raise UserError(f"{path}: skin {i} does not fit the particles: an index is outside, or shapes differ")
-            skins.append(skin_surface(f"skin {i}", faces, indices, weights, motion.x))
-        if found["collider"][0] is not None:
-            vertices, faces, poses = found["collider"]
-            if vertices.ndim != 2 or not _triangles(faces, len(vertices)) or poses.shape[1:] != (4, 4) or not len(poses):
-                raise UserError(f"{path}: collider {i} has vertices {vertices.shape}, faces {faces.shape} and poses {poses.shape}")
-            colliders.append(moved_surface(f"collider {i}", vertices, faces, poses))
-    motion.skins, content.surfaces = tuple(skins), tuple(colliders)
-
-
-def _within(indices: np.ndarray, count: int) -> bool:
-    return indices.dtype.kind in "iu" and bool(((indices >= 0) & (indices < count)).all())
-
-
-def _triangles(faces: np.ndarray, vertices: int) -> bool:
-    return faces.ndim == 2 and faces.shape[1] == 3 and _within(faces, vertices)
+    motion, (skins, colliders) = content.motions[0], read_surfaces(arrays, path)
+    motion.skins = tuple(
+        skin_surface(f"skin {i}", each["faces"], each["indices"], each["weights"], motion.x) for i, each in enumerate(skins)
+    )
+    content.surfaces = tuple(
+        moved_surface(f"collider {i}", each["vertices"], each["faces"], each["poses"]) for i, each in enumerate(colliders)
+    )
 
 
 def _times(given: np.ndarray | None, frames: int, path: Path) -> tuple[np.ndarray, bool]:
@@ -189,12 +146,6 @@ def _beside(folder: Path) -> tuple[Scene | None, list[Any]]:
             return scene, [load_law(folder / LAW)[0]]
         models = [model_from_dict(each["model"]) for each in content.get("bodies") or [content]]
         return scene, [material(model["elasticity"], model["plasticity"])[0] for model in models]
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """Return the PLY files of a folder whose names end in a number, in its order."""
-    found = [(int(match[1]), path) for path in folder.glob("*.ply") if (match := re.search(r"(\d+)$", path.stem))]
-    return [path for _, path in sorted(found)]
 
 
 def _ply_series(paths: Sequence[Path]) -> Content:
@@ -233,10 +184,10 @@ def _points(path: Path) -> np.ndarray:
 
 
 def _predictions(folder: Path, recording: str | None) -> Content:
-    names = sorted(path.parent.name for path in folder.glob("*/particles") if _numbered(path))
+    names = sorted(path.parent.name for path in folder.glob("*/particles") if numbered_files(path))
     if not names:
         raise UserError(f"{folder} has no particles: give a folder of `neuido predict`")
-    content = _ply_series(_numbered(folder / _pick(names, recording, folder) / "particles"))
+    content = _ply_series(numbered_files(folder / picked(names, recording, folder) / "particles"))
     content.notes += [f"one of {len(names)}: --recording chooses from {', '.join(names)}"] if len(names) > 1 and recording is None else []
     return content
 
@@ -247,7 +198,7 @@ def _experiment(folder: Path, recording: str | None) -> Content:
 
     experiment = read_experiment(folder)
     names = [each.name for each in experiment.recordings]
-    chosen = experiment[_pick(names, recording, folder)]
+    chosen = experiment[picked(names, recording, folder)]
     content = Content(f"{experiment.name}, {chosen.name}")
     if chosen.x is not None and chosen.t is not None:
         content.times = chosen.t.numpy()
@@ -308,7 +259,7 @@ def _diagnosis(folder: Path, recording: str | None) -> Content:
     found = {name: arrays for name, arrays in found.items() if {"measured", "before", "t"} <= arrays.keys() and arrays["before"].ndim == 3}
     if not found:
         raise UserError(f"{folder} is a diagnosis without a motion in space: open its report.html")
-    chosen = _pick(list(found), recording, folder)
+    chosen = picked(list(found), recording, folder)
     arrays = found[chosen]
     part = next((each for each in parts if chosen in each.get("recordings", {})), parts[0])
     own = part.get("recordings", {}).get(chosen, {})
