@@ -1,6 +1,6 @@
 """Attacks on the whole command line: each input runs in a fork of a warm process, in a folder of its own.
 
-    python -m tests.faults.attack [FIRST:LAST] [--out attack.csv] [--report attack.md] [--only NUMBER]
+    python -m tests.faults.attack [FIRST:LAST] [--workers 2] [--out attack.csv] [--report attack.md] [--only NUMBER]
 
 An input depends on its number alone. A command may do its work, or refuse it by one line of at most 300 characters and exit status 2 (1:
 a check failed); a signal ends it with 128 + n. Everything else is a fault: a traceback, another status, a write outside `out`, a trace in
@@ -11,8 +11,10 @@ what is then refused.
 import argparse
 import contextlib
 import csv
+import faulthandler
 import hashlib
 import json
+import multiprocessing
 import os
 import random
 import resource
@@ -46,8 +48,8 @@ STOP = 20.0
 """Seconds of a processor after which work that was accepted is ended by SIGTERM."""
 GRACE = 60.0
 """Seconds that it may then take to end."""
-WAIT = 900.0
-"""Seconds of the clock after which a command that waits for something is killed, on however busy a machine."""
+WAIT = 60.0
+"""Seconds of the clock that a command may sleep without any work in between; one that waits for the processor does not sleep."""
 KINDS = ("file", "value", "words", "configuration", "out", "surroundings", "signal", "file")
 """What an input attacks; damaged files count twice."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -259,18 +261,23 @@ def _forked(
     if interrupt is not None:
         time.sleep(interrupt[0])
         os.kill(child, interrupt[1])
-    told, end, last = 0.0, None, time.monotonic() + WAIT
+    told, end, before, awake = 0.0, None, 0.0, time.monotonic()
     while True:
         drain()
         done, code, usage = os.wait4(child, os.WNOHANG)
         if done:
             drain()
             break
-        used = _processor_seconds(child)
+        used, sleeps = _processor_seconds(child)
+        if used > before or not sleeps:
+            before, awake = used, time.monotonic()
         if end is None and used > STOP:
             os.kill(child, signal.SIGTERM)
             told, end = used, time.monotonic() + 4 * GRACE
-        elif time.monotonic() > last:
+        elif time.monotonic() > awake + WAIT:
+            os.kill(child, signal.SIGUSR1)  # it says where it waits
+            time.sleep(0.5)
+            drain()
             os.kill(child, signal.SIGKILL)
         elif end is not None and (used > told + GRACE or time.monotonic() > end):
             os.kill(child, signal.SIGKILL)
@@ -282,12 +289,13 @@ def _forked(
     return (None if status == -signal.SIGKILL else status), usage.ru_utime + usage.ru_stime, texts[1].decode(errors="replace"), found
 
 
-def _processor_seconds(pid: int) -> float:
+def _processor_seconds(pid: int) -> tuple[float, bool]:
+    """Return how long a process has worked [s], and whether it sleeps now."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return 0.0, False
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), fields[0] == "S"
 
 
 def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None], pipes: list[int]) -> None:
@@ -301,6 +309,7 @@ def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None],
         os.environ |= LIMITS | {"TMPDIR": str(root / "tmp")}
         os.dup2(pipes[0], 1)
         os.dup2(pipes[1], 2)
+        faulthandler.register(signal.SIGUSR1, file=pipes[1], all_threads=True)
         sys.stdout = open(1, "w", closefd=False, encoding="utf-8")
         sys.stderr = open(2, "w", closefd=False, encoding="utf-8", errors="backslashreplace")
         sys.argv = ["neuido", *words]
@@ -326,7 +335,7 @@ def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None],
 def _fault(target: Target, kind: str, what: str, status: int | None, seconds: float, err: str, notes: list[str]) -> str:
     """Return what is wrong with how a command ended."""
     if status is None:
-        return "does not end"
+        return f"does not end: {' '.join(err.split())[-600:]}"
     if "Traceback (most recent call last)" in err:
         return "traceback: " + " ".join(err.strip().splitlines()[-2:])[:300]
     stopped = status in INTERRUPTED or (kind == "signal" and -status in SIGNALS)  # before the command could take it
@@ -451,22 +460,55 @@ def report(rows: list[dict[str, str]], path: Path) -> None:
     path.write_text("\n".join(out))
 
 
+def _work(share: list[int], folder: Path, found: Any) -> None:
+    """Run a share of the inputs in a process of its own, and hand over each result."""
+    folder.mkdir()
+    try:
+        for attack in attacks(share, folder):
+            found.put(attack)
+    finally:
+        found.put(None)
+
+
+def run_shares(numbers: Iterable[int], folder: Path, workers: int) -> Iterable[Attack]:
+    """Run inputs in several processes; those of one command stay together, the quick commands first."""
+    context = multiprocessing.get_context("fork")
+    order = sorted(range(len(TARGETS)), key=lambda i: not TARGETS[i].quick)
+    place = {target: i for i, target in enumerate(order)}
+    numbers = sorted(numbers, key=lambda n: (place[n % len(TARGETS)], n))
+    found = context.SimpleQueue()  # which has no thread: the workers fork
+    shares = [[n for n in numbers if place[n % len(TARGETS)] % workers == i] for i in range(workers)]
+    own = [context.Process(target=_work, args=(share, folder / str(i), found)) for i, share in enumerate(shares)]
+    for process in own:
+        process.start()
+    left = workers
+    while left:
+        attack = found.get()
+        left -= attack is None
+        if attack is not None:
+            yield attack
+
+
 def run() -> None:
-    """Run inputs, and write a row each."""
+    """Run inputs, and write a row each; numbers that the table has already are left out."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("numbers", nargs="?", default="0:1680")
     parser.add_argument("--out", type=Path, default=Path("attack.csv"))
     parser.add_argument("--report", type=Path)
     parser.add_argument("--only", type=int, nargs="+")
+    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
     first, last = map(int, given.numbers.split(":"))
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-    rows = []
+    rows = list(csv.DictReader(given.out.open(newline=""))) if given.out.is_file() and not given.only else []
+    there = {int(row["number"]) for row in rows}
     try:
         with given.out.absolute().open("w", newline="") as file:
             writer = csv.DictWriter(file, Attack._fields)
             writer.writeheader()
-            for found in attacks(given.only or range(first, last), folder):
+            writer.writerows(rows)
+            wanted = given.only or [number for number in range(first, last) if number not in there]
+            for found in run_shares(wanted, folder, given.workers) if given.workers > 1 else attacks(wanted, folder):
                 rows.append({key: f"{value:.2f}" if isinstance(value, float) else str(value) for key, value in found._asdict().items()})
                 writer.writerow(rows[-1])
                 file.flush()

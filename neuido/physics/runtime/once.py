@@ -1,6 +1,7 @@
 """Thread-safe caches: each entry is computed once, by one thread at a time."""
 
 import functools
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -9,6 +10,9 @@ from typing import Any
 BUILDING = threading.RLock()
 """Lock that is held while kernels are built or loaded. There is one for the whole process, since Warp's tables of functions and modules are
 global. It is reentrant, since a builder may call another."""
+
+if hasattr(os, "register_at_fork"):  # a fork while another thread builds would have half of a kernel, and a lock that nobody releases
+    os.register_at_fork(before=BUILDING.acquire, after_in_parent=BUILDING.release, after_in_child=BUILDING.release)
 
 
 def cached(function: Callable[..., Any] | None = None, *, limit: int | None = None) -> Any:

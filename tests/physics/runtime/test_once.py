@@ -1,5 +1,7 @@
 """What several threads ask for at once is made once, whole, and in a fresh process does not bring it down."""
 
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -12,12 +14,13 @@ import torch
 from neuido.data.bodies.shapes import cube
 from neuido.physics.laws.classical import NeoHookean
 from neuido.physics.mpm.simulator import Simulator
-from neuido.physics.runtime.once import cached
-from neuido.physics.runtime.threads import one_thread_each
+from neuido.physics.runtime.once import BUILDING, cached
+from neuido.physics.runtime.threads import one_thread_each, scene_pool
 from neuido.types import Scene
 
 BUILD = """
-import sys, threading
+import faulthandler, sys, threading
+faulthandler.dump_traceback_later(800, exit=True)  # some five times what the slowest process took on a busy machine
 import torch
 from neuido.data.bodies.shapes import cube
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
@@ -46,6 +49,7 @@ threads = [threading.Thread(target=work, args=(i,)) for i in range(8)]
 for t in threads: t.start()
 for t in threads: t.join()
 assert not errors, errors
+faulthandler.cancel_dump_traceback_later()
 assert len(found["learned"]) == 4 and all(torch.equal(x, found["learned"][0]) for x in found["learned"])
 print("whole")
 """
@@ -53,8 +57,8 @@ print("whole")
 
 def processes(count: int) -> None:
     for _ in range(count):
-        done = subprocess.run([sys.executable, "-c", BUILD], capture_output=True, text=True, timeout=3000)
-        assert done.returncode == 0 and done.stdout.strip() == "whole", (done.returncode, done.stderr[-600:])
+        done = subprocess.run([sys.executable, "-c", BUILD], capture_output=True, text=True)
+        assert done.returncode == 0 and done.stdout.strip() == "whole", (done.returncode, done.stderr[-6000:])
 
 
 @pytest.mark.slow
@@ -65,6 +69,41 @@ def test_eight_threads_of_fresh_processes_build_the_kernels_at_once():
 @pytest.mark.slow
 def test_fifty_fresh_processes_of_eight_threads():
     processes(50)
+
+
+def forked(work):
+    """Return the exit status of a fork that does some work, and ends after ten seconds whatever it waits for."""
+    child = os.fork()
+    if child == 0:
+        signal.alarm(10)
+        status = 1
+        try:
+            status = 0 if work() else 2
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def test_a_fork_has_threads_of_its_own():
+    pool = scene_pool()
+    assert [pool.submit(abs, -i).result(10) for i in range(4)] == list(range(4))
+    assert forked(lambda: [pool.submit(abs, -i).result() for i in range(4)] == list(range(4))) == 0
+    assert pool.submit(abs, -5).result(10) == 5
+
+
+def test_a_fork_waits_until_no_thread_builds():
+    building, end = threading.Event(), threading.Event()
+
+    def build():
+        with BUILDING:
+            building.set()
+            end.wait(0.2)
+
+    thread = threading.Thread(target=build)
+    thread.start()
+    building.wait()
+    assert forked(lambda: BUILDING.acquire(timeout=5.0)) == 0
+    thread.join()
 
 
 def test_threads_get_the_one_result_of_a_slow_function():
