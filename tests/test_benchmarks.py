@@ -19,6 +19,7 @@ sys.path.insert(0, str(FOLDER))
 
 import plain  # noqa: E402
 import rollout  # noqa: E402
+import room  # noqa: E402
 import scaling  # noqa: E402
 
 
@@ -106,3 +107,12 @@ def test_scaling_writes_its_table_and_its_picture(tmp_path, capsys):
     assert slope == pytest.approx(1.0, abs=0.3)  # memory is counted, not sampled; the grid's share does not grow
     picture = matplotlib.image.imread(tmp_path / "out" / "scaling.png")
     assert picture.std() > 0.05
+
+
+@pytest.mark.slow
+def test_memory_in_a_large_domain_follows_the_body(tmp_path):
+    room.main(["--device", "cpu", "--particles", "20000", "--factors", "1", "1000000", "8000000", "--out", str(tmp_path)])
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in (tmp_path / "room.md").read_text().splitlines()[2:]]
+    assert [int(row[1]) for row in rows] == [24, 2400, 4800]
+    assert len({row[3] for row in rows[1:]}) == 1  # eight times the room, the same memory
+    assert len({row[5] for row in rows[1:]}) == 1
