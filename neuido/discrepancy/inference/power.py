@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import foldnorm, truncnorm
+from scipy.optimize import brentq
+from scipy.stats import t as student
 
 from neuido.discrepancy.inference import directions, discretisation
 from neuido.discrepancy.inference.floors import Round, Stand, Trial, patterns
 from neuido.discrepancy.inference.laboratory import Laboratory
-from neuido.discrepancy.problems.problem import Parameter
+from neuido.discrepancy.problems.problem import Parameter, Point
 
 COMPATIBLE = 0.9
 """Probability that the size of an effect is below its upper limit."""
@@ -35,10 +36,12 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
     """Return the size that each effect does not exceed with a probability of 90 %.
 
     The estimate is linear, from the fitted recordings. The size of an effect is fitted to the residual after the fitted parameters, the
-    nuisances and the differences between settings are projected out. Its uncertainty comes from the noise and from smooth patterns of the
-    size of the discretisation error after a refit. If the residual is larger than both, the uncertainty grows with it (Birge's ratio). The
-    prior is flat, over one sign if the effect has only one. Of several shapes of an effect, the largest limit counts. The directions are
-    those of the screening, so that hardly anything is simulated anew after a search.
+    nuisances and the differences between settings are projected out. Its uncertainty comes from the noise, from smooth patterns of the
+    size of the discretisation error after a refit, and from errors of the instruments that no nuisance has (`Problem.instrument_errors`).
+    If the residual is larger than all of these, or neighbouring data err alike, the uncertainty grows with it: a residual of few
+    independent data may hide an effect of its own size (`excess`). The prior is flat, over one sign if the effect has only one. Of several
+    shapes of an effect, the largest limit counts. The directions are those of the screening, so that hardly anything is simulated anew
+    after a search.
 
     Args:
         lab: The method that gives the answer.
@@ -70,17 +73,16 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
             own_rows = patterns(problem, r.floor, part, square)
             unseen[part.recording] = np.zeros((len(part.rows), own_rows.shape[1]))
             unseen[part.recording][part.rows] = own_rows
-    S = project(unseen)
-    expected = 1.0 + float(np.sum(S**2)) / max(len(left), 1)
-    birge = max(float(np.mean(left**2)) / expected, 1.0)
+    S = np.concatenate([project(unseen), project(_each_its_own(lab, at.fit.point))], axis=1)
+    growth, freedom = excess(left, S, _series(lab))
     largest: dict[tuple[str, str], Compatible] = {}
     for c in candidates:
         if c.name in taken:
             continue
         for i, start in enumerate(c.starts):
             means, deviations = amounts(project(columns[c.key, i]), left, S)
-            for p, mean, deviation in zip(c.size_parameters, means, deviations * math.sqrt(birge), strict=True):
-                size = bound(p, start[p.name] * mean, abs(start[p.name]) * deviation)
+            for p, mean, deviation in zip(c.size_parameters, means, deviations * math.sqrt(growth), strict=True):
+                size = bound(p, start[p.name] * mean, abs(start[p.name]) * deviation, freedom)
                 one = Compatible(c.name, p.name.partition(".")[2], p.unit, size if size < max(abs(p.lower), abs(p.upper)) else None)
                 before = largest.get((c.name, one.parameter))
                 if before is None or (before.up_to is not None and (one.up_to is None or one.up_to > before.up_to)):
@@ -106,14 +108,60 @@ def amounts(B: np.ndarray, left: np.ndarray, S: np.ndarray) -> tuple[np.ndarray,
     return -inverse @ (B.T @ left), np.where(squares > 0.0, np.sqrt(variances), math.inf)
 
 
-def bound(p: Parameter, mean: float, deviation: float) -> float:
-    """Return the size that a Gaussian amount does not exceed with a probability of 90 %, if the range of `p` limits its sign.
+def excess(left: np.ndarray, S: np.ndarray, series: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the factor by which a residual enlarges the variance of what is fitted to it, and the degrees of freedom of that estimate.
 
-    The size is infinite if the deviation is zero or not finite.
+    The factor is the mean square of the residual (Birge's ratio), divided by the share of the data that is independent. That share is
+    (1 - r) / (1 + r) for a correlation r of neighbouring data (Bayley and Hammersley 1946). The factor is at least one.
+
+    Args:
+        left: Residual, (n,), whitened.
+        S: Patterns that `left` may hold beside white noise, (n, s), with amounts of variance one.
+        series: Indices of the data of each series, in the order of time.
+    """
+    n = max(len(left), 1)
+    white = left - S @ np.linalg.solve(np.eye(S.shape[1]) + S.T @ S, S.T @ left)
+    products = sum(float(white[i[1:]] @ white[i[:-1]]) for i in series)
+    alike = float(np.clip(products / max(float(white @ white), 1e-300), 0.0, 1 - 2 / (n + 1)))  # so that one datum is left at the least
+    independent = n * (1 - alike) / (1 + alike)
+    return max(float(left @ white) / independent, 1.0), max(independent - 1, 1.0)
+
+
+def _each_its_own(lab: Laboratory, point: Point) -> dict[int, np.ndarray]:
+    """Return the errors of the instruments of each fitted recording, (n, k): columns of their own, zero in the other recordings."""
+    found = {n: lab.problem.instrument_errors(point, n) for n in lab.fitted_recordings}
+    width, out, begun = sum(own.shape[1] for own in found.values()), {}, 0
+    for n, own in found.items():
+        out[n] = np.zeros((len(own), width))
+        out[n][:, begun : begun + own.shape[1]] = own
+        begun += own.shape[1]
+    return out
+
+
+def _series(lab: Laboratory) -> list[np.ndarray]:
+    """Return the indices of the data of each series, in the order of time, among the fitted rows of all recordings together."""
+    out, begun = [], 0
+    masks = {p.recording: p.rows for p in lab.parts if p.fitted}
+    for n in lab.fitted_recordings:
+        groups, times = (of[masks[n]] for of in (lab.problem.recordings[n].groups, lab.problem.recordings[n].times))
+        order = np.lexsort((times, groups))
+        out += [begun + own for own in np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)]
+        begun += len(groups)
+    return out
+
+
+def bound(p: Parameter, mean: float, deviation: float, freedom: float = math.inf) -> float:
+    """Return the size that an amount does not exceed with a probability of 90 %, if the range of `p` limits its sign.
+
+    The amount has Student's distribution, which is Gaussian for infinitely many degrees of freedom. The size is infinite if the deviation
+    is zero or not finite.
     """
     if not math.isfinite(deviation) or deviation <= 0.0:
         return math.inf
     if p.lower < 0.0 < p.upper:
-        return float(deviation * foldnorm.ppf(COMPATIBLE, abs(mean) / deviation))
-    mean = mean if p.upper > 0.0 else -mean
-    return float(truncnorm.ppf(COMPATIBLE, -mean / deviation, math.inf, loc=mean, scale=deviation))
+        at = abs(mean) / deviation
+        most = at + float(student.ppf(0.5 * (1 + COMPATIBLE), freedom))
+        within = brentq(lambda u: student.cdf(u - at, freedom) - student.cdf(-u - at, freedom) - COMPATIBLE, 0.0, most * (1 + 1e-9))
+        return float(deviation * within)
+    at = (mean if p.upper > 0.0 else -mean) / deviation
+    return float(deviation * (at + student.isf((1 - COMPATIBLE) * student.cdf(at, freedom), freedom)))

@@ -153,7 +153,8 @@ class Problem:
     solvers: tuple[int, ...] = (0,)
     """Settings that stand for a simulation method each. The data choose among them."""
     labels: dict[str, Any] = field(default_factory=dict)
-    """Facts for the report: `kind` of the data, `body`, and effects that are `excluded`, with the reason."""
+    """Facts for the report: `kind` of the data, `body`, effects that are `excluded`, with the reason, and `ordinary` sizes that parameters
+    of effects have by the declared figures."""
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         """Predict the data of a recording for each parameter set, (len(points), n); a row is NaN where the simulation fails."""
@@ -194,6 +195,13 @@ class Problem:
         """Return smooth patterns (n, k) that describe a discretisation error of unknown shape.
 
         The squares of the k patterns add up to one, in the mean over the n values.
+        """
+        return np.empty((len(self.recordings[recording].y), 0))
+
+    def instrument_errors(self, point: Point, recording: int) -> np.ndarray:
+        """Return how one standard deviation of each error of the instruments that no nuisance has changes a recording, (n, k).
+
+        The fit cannot take these errors up. They limit what the data can exclude.
         """
         return np.empty((len(self.recordings[recording].y), 0))
 

@@ -174,9 +174,10 @@ def _chance(r: Round, step: int) -> dict[str, Any]:
 
 
 def _power(d: Diagnosis, one: Compatible) -> dict[str, Any]:
-    """Return the largest size of an effect that the data allow, with the largest size of its range."""
+    """Return the largest size of an effect that the data allow, with the largest and, if it is known, the ordinary size."""
     p = d.problem.parameter(f"{one.name}.{one.parameter}")
-    return {**one._asdict(), "largest": max(abs(p.lower), abs(p.upper))}
+    ordinary = d.problem.labels.get("ordinary", {}).get(p.name)
+    return {**one._asdict(), "largest": max(abs(p.lower), abs(p.upper))} | ({} if ordinary is None else {"ordinary": ordinary})
 
 
 def _series(s: residual.Series) -> dict[str, Any]:

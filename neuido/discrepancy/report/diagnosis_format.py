@@ -81,7 +81,7 @@ def schema() -> Schema:
         {"step": STEP, "name": TEXT, "verdict": {"enum": list(VERDICTS)}, "reason": ANY_TEXT, "parameters": mapping(MEASURED)},
         {"form": ANY_TEXT, "error_ratio": MAYBE, "log_evidence": MAYBE, "score": MAYBE, "cosine": MAYBE},
     )
-    power = record({"name": TEXT, "parameter": TEXT, "unit": ANY_TEXT, "up_to": MAYBE}, {"largest": MAYBE})
+    power = record({"name": TEXT, "parameter": TEXT, "unit": ANY_TEXT, "up_to": MAYBE}, {"largest": MAYBE, "ordinary": NUMBER})
     recording = record(
         {"role": {"enum": ["fit", "held_out"]}},
         {

@@ -252,6 +252,7 @@ def _finding(c: Content, units: Units) -> str:
         out += [f"A limit and no size, since a later fit moved it: {e['at_limit']}." for e in effects if e.get("at_limit")]
     elif answer == "none":
         out.append("Nothing is missing that these data could show.")
+        out += [_ordinary(row, units) for row in c["power"] if row.get("ordinary")]
         over = c["error"].get("left_over_noise")
         if over is not None and over > STANDS_ABOVE:
             out.append(f"What remains stands at {over:.1f} times the noise, so an effect that does less would not be seen.")
@@ -268,6 +269,18 @@ def _finding(c: Content, units: Units) -> str:
         if c["untried"]:
             out.append(f"Not tried: {listed([title(name) for name in c['untried']])}.")
     return " ".join(out)
+
+
+def _ordinary(row: Content, units: Units) -> str:
+    """Return a sentence on an effect that such a body has, whether the data exclude its size or not."""
+    size = units.said(row["ordinary"], row["unit"])
+    has = f"A smooth sphere of this mass and size has a {title(row['name'])} of about {size}"
+    if row["up_to"] is None:
+        return f"{has}, and these data set no limit to it."
+    limit = units.said(row["up_to"], row["unit"])
+    if row["up_to"] >= row["ordinary"]:
+        return f"{has}, which these data cannot tell from none: up to {limit} agrees with them."
+    return f"{has}, and these data exclude more than {limit}: check the length scale, the clock and gravity."
 
 
 def most_over(error: Content) -> float:

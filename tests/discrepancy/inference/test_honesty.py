@@ -135,6 +135,26 @@ def test_a_compatible_size_is_exceeded_in_one_of_ten():
     assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
 
 
+def test_a_compatible_size_allows_for_data_that_err_alike():
+    """Also of a residual whose error is slow: its neighbouring data are hardly independent."""
+    rng = np.random.default_rng(5)
+    n, reps, alike = 120, 200, 0.8
+    p = Parameter("a.b", "m", 0.0, 1.0, -9.0, 9.0)
+    B, none = np.linspace(-1, 1, n)[:, None] ** 2, np.empty((n, 0))
+    noise = rng.normal(size=(reps, n))
+    for i in range(1, n):
+        noise[:, i] = alike * noise[:, i - 1] + math.sqrt(1 - alike**2) * noise[:, i]
+    told, plain = [], []
+    for left in noise:
+        (mean,), (deviation,) = power.amounts(B, left - 3.0 * B[:, 0], none)
+        growth, freedom = power.excess(left, none, [np.arange(n)])
+        told.append(power.bound(p, mean, math.sqrt(growth) * deviation, freedom) > 3.0)
+        plain.append(power.bound(p, mean, deviation) > 3.0)
+    assert np.mean(told) > 0.85 > 0.75 > np.mean(plain)
+    growth, freedom = power.excess(rng.normal(size=n), none, [np.arange(n)])
+    assert growth < 1.5 and freedom > 60
+
+
 def test_sizes_that_do_the_same_have_no_limit():
     t = np.linspace(0.0, 1.0, 30)
     _, deviations = power.amounts(np.stack([t, 2.0 * t, t**2], axis=1), 0.0 * t, np.empty((30, 0)))

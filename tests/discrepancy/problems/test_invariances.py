@@ -40,10 +40,12 @@ def written(source, target, body, *, origin=0.0, unit=1.0, axis="y", backwards=F
 
 
 def answered(folder):
-    """The answer, all effects of its classes, and the error that is left over that before."""
+    """The answer and all effects of its classes; the drag that such a ball has is not excluded where it is not named."""
     (problem,) = track_problems(folder)
     found = diagnose(restricted(problem, EFFECTS), draws=39, most=1)
     names = {t.candidate.name for r in found.rounds if r.chosen is not None for t in r.members} if found.effects else set()
+    ordinary = problem.labels["ordinary"].get("drag_quadratic.k", 0.0)
+    assert all(one.up_to is None or one.up_to > ordinary for one in found.power if one.name == "drag_quadratic")
     return found.answer, names | {t.candidate.name for t in found.effects}
 
 

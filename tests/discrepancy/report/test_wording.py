@@ -46,6 +46,14 @@ def test_none_says_what_could_have_been_seen_and_where_the_residual_stands():
     assert "4.0 times the noise" in words_of(c).finding
 
 
+def test_none_says_whether_it_excludes_what_such_a_body_has():
+    row = {"name": "drag_quadratic", "parameter": "k", "unit": "1/m", "largest": 0.05, "ordinary": 0.008}
+    asked = [(0.02, "cannot tell from none"), (None, "set no limit to it"), (0.001, "check the length scale, the clock and gravity")]
+    for up_to, said in asked:
+        c = content(answer="none", effects=[], models=[], power=[row | {"up_to": up_to}])
+        assert said in words_of(c).finding and "quadratic air drag of about 0.00800 per metre" in words_of(c).finding
+
+
 def test_unfinished_names_a_lead_and_what_was_not_tried():
     c = content(
         answer="unfinished",

@@ -198,15 +198,41 @@ def settled_error(start: Released, forces: Forces, frames: int) -> float:
     and which grows with time.
     """
     parameters, t = start.parameters, start.track.t
-    scale = np.array([p.scale for p in parameters])
-    values = settle(start, forces, 1, frames)
-    probes = np.concatenate([values, values + PROBE * np.diag(scale)])
-    seen = start.seen(probes, _repeated(forces, 1, len(probes)), t)
-    J = np.moveaxis(seen[1:] - seen[0], 0, -1) / PROBE  # (n, A, k)
+    J, _ = _influence(start, forces, frames)
     early = np.moveaxis(start.whiten(np.moveaxis(J[:frames], -1, 0)), 0, -1).reshape(-1, len(parameters))
     information = early.T @ early + np.diag([p.prior**-2 if p.prior is not None else 0.0 for p in parameters])
     spread = np.einsum("nak,kl,nal->na", J[frames:], np.linalg.pinv(information), J[frames:])
     return float(np.sqrt(spread.mean() + start.variance))
+
+
+def scale_gradient(start: Released, forces: Forces) -> np.ndarray:
+    """Return how a length scale that changes along the path of a fitted recording changes its coordinates, (n, A) [m].
+
+    A scale that is known to some standard deviation need not be off by the same amount everywhere: a camera that looks askew, or from
+    near, sees it change over the field. One standard deviation is a change by that of the scale from the release to the farthest point.
+    What the nuisances make up for is removed, to first order. Without an uncertain scale the result is zero.
+    """
+    sd = next((p.prior * p.scale for p in start.parameters if p.name.startswith("length_scale")), 0.0)
+    J, seen = _influence(start, forces, len(start.track.t))
+    moved = seen - seen[:1]
+    far = np.linalg.norm(moved, axis=1, keepdims=True)
+    column = sd * moved * far / max(float(far.max()), 1e-300)
+    white = np.moveaxis(start.whiten(np.moveaxis(J, -1, 0)), 0, -1).reshape(-1, J.shape[-1])
+    information = white.T @ white + np.diag([p.prior**-2 if p.prior is not None else 0.0 for p in start.parameters])
+    taken = np.linalg.pinv(information) @ (white.T @ start.whiten(column[None])[0].reshape(-1))
+    return column - J @ taken
+
+
+def _influence(start: Released, forces: Forces, frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives (n, A, k) of all frames by the nuisances in units of their `scale`, and the frames (n, A) [m].
+
+    The nuisances are those that `settle` fits to the first `frames` frames.
+    """
+    scale = np.array([p.scale for p in start.parameters])
+    values = settle(start, forces, 1, frames)
+    probes = np.concatenate([values, values + PROBE * np.diag(scale)])
+    seen = start.seen(probes, _repeated(forces, 1, len(probes)), start.track.t)
+    return np.moveaxis(seen[1:] - seen[0], 0, -1) / PROBE, seen[0]
 
 
 def _repeated(forces: Forces, count: int, times: int) -> Forces:

@@ -12,6 +12,8 @@ from neuido.physics.effects.library import KNOTS, LIBRARY
 
 LIGHTEST, SMALLEST = 30.0, 0.02
 """Least density [kg/m^3] and diameter [m] of a flying body, assumed where the folder does not give them."""
+SPHERE_DRAG = 0.47
+"""Drag coefficient of a smooth sphere at Reynolds numbers of 1e3 to 2e5 (Hoerner, Fluid-Dynamic Drag, 1965)."""
 LARGEST_DRAG = 2.0
 """Upper limit of the drag coefficient of a compact body."""
 DAMPED = 1000.0
@@ -124,6 +126,16 @@ def track_candidates(tracks: Tracks, body: str, flights: Sequence[Track]) -> tup
             add("bounce_friction", {"mu": 0.1}, ("mu", 0.05, 0.0, 2.0))
         add("bounce_speed", {"p": 0.05}, ("p", 0.03, -0.5, 0.5))
     return tuple(out)
+
+
+def ordinary_sizes(tracks: Tracks, body: str) -> dict[str, float]:
+    """Return the sizes of effects that a flying sphere has by its mass, its diameter and what it moves in, by parameter."""
+    figures = tracks.bodies[body]
+    flies = tracks.constraint is None or tracks.constraint.type == "bounce"
+    if not flies or len(figures) < 2 or tracks.shapes.get(body) == "disc" or tracks.fluid_density == 0:
+        return {}
+    area = math.pi / 4 * figures["diameter"] ** 2
+    return {"drag_quadratic.k": tracks.fluid_density * SPHERE_DRAG * area / (2 * figures["mass"])}
 
 
 def _of_angles(unit: str) -> str:

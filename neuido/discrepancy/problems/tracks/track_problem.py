@@ -13,8 +13,8 @@ from neuido.data.measured.track import AIR, AXES, Track, Tracks, read_tracks
 from neuido.discrepancy.problems.noise import SeriesError, correlation, high_pass
 from neuido.discrepancy.problems.problem import Point, Problem, Recording
 from neuido.discrepancy.problems.tracks.guides import guide_of, normal_of
-from neuido.discrepancy.problems.tracks.released import Released, settle, settled_error
-from neuido.discrepancy.problems.tracks.track_candidates import declared_parameter, track_candidates
+from neuido.discrepancy.problems.tracks.released import Released, scale_gradient, settle, settled_error
+from neuido.discrepancy.problems.tracks.track_candidates import declared_parameter, ordinary_sizes, track_candidates
 from neuido.physics.effects.library import KNOTS
 from neuido.physics.points.point_mass import Forces
 
@@ -65,7 +65,7 @@ class TrackProblem(Problem):
             nuisances=(),
             candidates=candidates,
             recordings=tuple(map(self._recording, self._flights, self._starts)),
-            labels={"kind": "track", "body": body},
+            labels={"kind": "track", "body": body, "ordinary": ordinary_sizes(tracks, body)},
         )
 
     def _released(self, track: Track, effects: set[str]) -> Released:
@@ -115,6 +115,12 @@ class TrackProblem(Problem):
         if track.role != "held_out":
             return self.recordings[recording].noise
         return settled_error(start, self.forces([point], track), _early(track))
+
+    def instrument_errors(self, point: Point, recording: int) -> np.ndarray:
+        track, start = self._flights[recording], self._starts[recording]
+        if not any(name == "length_scale" for name in start.names) or track.role == "held_out":
+            return super().instrument_errors(point, recording)
+        return scale_gradient(start, self.forces([point], track)).reshape(-1, 1)
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         if not points:
