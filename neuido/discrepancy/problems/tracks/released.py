@@ -197,7 +197,7 @@ def settled_error(start: Released, forces: Forces, frames: int) -> float:
     It is the tracking error of these frames together with the error of the nuisances, which `settle` fits to the first `frames` frames
     and which grows with time.
     """
-    parameters, t = start.parameters, start.track.t
+    parameters = start.parameters
     J, _ = _influence(start, forces, frames)
     early = np.moveaxis(start.whiten(np.moveaxis(J[:frames], -1, 0)), 0, -1).reshape(-1, len(parameters))
     information = early.T @ early + np.diag([p.prior**-2 if p.prior is not None else 0.0 for p in parameters])
