@@ -75,7 +75,7 @@ def rasterize(
         eps2d: Number added to the diagonal of the covariance in pixels [pixels^2].
         backend: `warp`, `torch`, `gsplat`, or `auto` (warp).
         capacity: Maximum total length of the tile lists on CUDA. With it, the call never synchronises with the device and can be captured
-            in a CUDA graph; images are NaN if it is too small. Without it, the call reads one number back.
+            in a CUDA graph; images are NaN if it is too small. Without it, the call reads one number back after its launches.
 
     Returns:
         Images (..., V, H, W, 3), and alphas (..., V, H, W): the coverage of each pixel by Gaussians.
@@ -211,6 +211,8 @@ class _TileLists:
     ranges: Tensor
     broken: Tensor | None = None
     """With a capacity, a bool on the device: whether the capacity was too small or a number was not finite."""
+    entries: "_Entries | None" = None
+    """Length of all lists, from CUDA without a capacity."""
 
 
 def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int) -> _TileLists:
@@ -232,22 +234,69 @@ def _lists_by_counting(kernels, splat, depth: Tensor, status: Tensor, columns: i
     return lists
 
 
-def _lists_by_key(kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None) -> _TileLists:
-    """Build the tile lists on CUDA by one sort of keys that combine tile and depth."""
+class _Entries:
+    """Number of entries of the tile lists, on its way from the device.
+
+    Args:
+        numbers: Number of broken Gaussians, and of entries, (2,) int64 on the device.
+    """
+
+    def __init__(self, numbers: Tensor) -> None:
+        self.host, self.arrived = numbers, None
+        if numbers.is_cuda:
+            self.host = torch.empty(2, dtype=torch.int64, pin_memory=True).copy_(numbers, non_blocking=True)
+            self.arrived = torch.cuda.Event()
+            self.arrived.record(torch.cuda.current_stream(numbers.device))
+
+    def wait(self) -> int:
+        """Return the number of entries.
+
+        Raises:
+            UserError: Numbers are not finite, or there are too many entries.
+        """
+        if self.arrived is not None:
+            self.arrived.synchronize()
+        bad, total = self.host.tolist()
+        _check(bad, total)
+        return total
+
+
+ROOM, LARGEST_ROOM = 1.125, 1.5
+"""Room of the tile lists relative to the entries of a call, when it is chosen and at most. Views and frames differ by some per cent; a call
+whose entries do not fit is drawn twice; one size is kept, so that memory and recorded launches are used again."""
+_rooms: dict[tuple, int] = {}
+
+
+def _set_room(key: tuple, total: int) -> None:
+    """Choose the room of the next call of a size from the entries of this one."""
+    if not total <= _rooms.get(key, -1) <= LARGEST_ROOM * total:
+        if len(_rooms) > 1000:
+            _rooms.clear()
+        _rooms[key] = min(int(ROOM * total) + 1, INDEX_LIMIT)
+
+
+def _lists_by_key(
+    kernels, splat, depth: Tensor, status: Tensor, columns: int, tiles: int, capacity: int | None, room: int | None = None
+) -> _TileLists:
+    """Build the tile lists on CUDA by one sort of keys that combine tile and depth.
+
+    Only the device knows the length of the lists. With `room`, what follows can be launched before the length has arrived
+    (`_TileLists.entries`); if it exceeds the room, the lists are incomplete and must be built again.
+    """
     images, count = depth.shape
     device = depth.device
     lists = _TileLists()
     found = torch.empty(images * count, dtype=torch.int32, device=device)
     launch(kernels.count, images * count, [*splat, found], device)
     ends = found.cumsum(0)
-    if capacity is None:
-        bad, total = torch.stack([status[0].long(), ends[-1]]).tolist()  # the only synchronisation with the device
-        _check(bad, total)
-    else:
+    if capacity is not None:
         total = capacity
         lists.broken = (ends[-1] > capacity) | (status[0] > 0)
+    else:
+        lists.entries = _Entries(torch.stack([status[0].long(), ends[-1]]))
+        total = lists.entries.wait() if room is None else room
     keys = torch.full((max(total, 1),), 2**63 - 1, dtype=torch.int64, device=device)
-    splats = torch.zeros(max(total, 1), dtype=torch.int32, device=device)
+    splats = torch.empty(max(total, 1), dtype=torch.int32, device=device)
     launch(kernels.emit, images * count, [*splat, depth.view(-1), ends, count, columns, tiles, keys, splats], device)
     keys, order = torch.sort(keys, stable=True)
     lists.splats = splats[order]
@@ -288,23 +337,35 @@ class _Splat(torch.autograd.Function):
         status = torch.zeros(1, dtype=torch.int32, device=device)
         stride = count if len(opacities) > 1 else 0
         strides = (colours.shape[1] * count if len(colours) > 1 else 0, count if colours.shape[1] > 1 else 0)
-        image = torch.zeros(frames, views, height, width, 3, **new)
-        clear = torch.ones(frames, views, height, width, **new)
-        last = torch.zeros(frames, views, height, width, dtype=torch.int32, device=device)
+        if one_thread_per_tile(device):
+            image, clear = torch.zeros(frames, views, height, width, 3, **new), torch.ones(frames, views, height, width, **new)
+            last = torch.zeros(frames, views, height, width, dtype=torch.int32, device=device)
+        else:  # each pixel is written
+            image, clear = torch.empty(frames, views, height, width, 3, **new), torch.empty(frames, views, height, width, **new)
+            last = torch.empty(frames, views, height, width, dtype=torch.int32, device=device)
         with torch_stream(device):
             inputs = [means.view(-1, 3), covariances.view(-1, 3, 3), opacities.view(-1), stride, viewmats, Ks, count, width, height]
             flat = depth.view(-1)
             launch(kernels.project, images * count, [*inputs, near, far, eps2d, centre, conic, box, flat, status], device)
             found = (kernels, (centre, conic, box), depth, status, columns, tiles)
-            lists = _lists_by_counting(*found) if device.type == "cpu" else _lists_by_key(*found, capacity)
-            tables = [lists.ranges, lists.splats, centre, conic]
             rest = [colours.view(-1, 3), *strides, count, views, width, height, columns, tiles]
             result = [image.view(-1, 3), clear.view(-1), last.view(-1)]
             blend = compose_kernels.build(real_of(dtype), side)
             if one_thread_per_tile(device):
-                launch(blend.compose_tile, images * tiles, [*tables, box, *rest, *result], device)
+                lists = _lists_by_counting(*found)
+                launch(blend.compose_tile, images * tiles, [lists.ranges, lists.splats, centre, conic, box, *rest, *result], device)
             else:
-                launch(blend.compose, images * tiles * side * side, [*tables, *rest, *result], device)
+                size = (device, images, count, tiles)
+                room = _rooms.get(size)
+                lists = _lists_by_key(*found, capacity, room)
+                pixels = images * tiles * side * side
+                launch(blend.compose, pixels, [lists.ranges, lists.splats, centre, conic, *rest, *result], device)
+                if lists.entries is not None:
+                    total = lists.entries.wait()
+                    if room is not None and total > room:
+                        lists = _lists_by_key(*found, None)
+                        launch(blend.compose, pixels, [lists.ranges, lists.splats, centre, conic, *rest, *result], device)
+                    _set_room(size, total)
         alphas = 1 - clear
         if lists.broken is not None:
             image = torch.where(lists.broken, torch.nan, image)

@@ -26,7 +26,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     name = f"neuido.grid.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
-    adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
 
     met = contact_functions.functions(real, name)
     contact, contact_adjoint, damp_contact, normal_of = met.contact, met.contact_adjoint, met.damp_contact, met.normal_of

@@ -48,7 +48,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     name = f"neuido.mpm.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
-    adjoint_kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
 
     own = stencil_functions.functions(real, name, native=real is wp.float32 and not enable_backward)
     velocity_of, first_moment, arrange, run_of = own.velocity_of, own.first_moment, own.arrange, own.run_of

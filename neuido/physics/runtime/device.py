@@ -81,10 +81,26 @@ def torch_stream(device: torch.device) -> Iterator[None]:
     """Open a context in which Warp launches go to torch's current stream."""
     if device.type == "cuda":
         # no synchronisation between streams: all work is on torch's stream, and a graph capture forbids it
-        with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False):
+        with wp.ScopedStream(_stream(torch.cuda.current_stream(device)), sync_enter=False):
             yield
     else:
         yield
+
+
+STREAM_CAPACITY = 64
+"""Largest number of streams in the cache; torch has 32 of each priority."""
+_streams: dict[tuple[int, int], wp.Stream] = {}
+
+
+def _stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """Return Warp's object of a torch stream, from a cache: registering a stream takes longer than a launch."""
+    key = (stream.device_index, stream.cuda_stream)
+    found = _streams.get(key)
+    if found is None:
+        if len(_streams) >= STREAM_CAPACITY:
+            _streams.clear()
+        found = _streams[key] = wp.stream_from_torch(stream)
+    return found
 
 
 def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, *, block: int = 256) -> None:
@@ -104,7 +120,10 @@ def launch(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.devic
             _launch_cached(kernel, dim, arguments, device)
         return
     _load(kernel, device, block)
-    wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
+    if torch.cuda.is_current_stream_capturing():  # a graph is captured once: nothing to reuse
+        wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=wp.device_from_torch(device), block_dim=block)
+    elif dim:
+        launch_recorded(kernel, dim, arguments, device, block)
 
 
 def launch_adjoint(kernel: wp.Kernel, dim: int, arguments: Sequence, adjoints: Sequence, device: torch.device) -> None:
@@ -191,15 +210,68 @@ COMMAND_CAPACITY = 12_000
 _commands: dict[tuple, _Command] = {}
 
 
+class _RecordedLaunch:
+    """A launch that Warp has recorded, with its numbers, and references to the arguments that are identified by their address."""
+
+    __slots__ = ("command", "numbers", "references")
+
+    def __init__(self, kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, block: int) -> None:
+        where = wp.device_from_torch(device)
+        self.command = wp.launch(kernel, dim=dim, inputs=_inputs(kernel, arguments), device=where, block_dim=block, record_cmd=True)
+        self.numbers = [(i, value) for i, value in enumerate(arguments) if isinstance(value, int | float)]
+        self.references = [value for value in arguments if not isinstance(value, Tensor)]
+
+    def run(self, numbers: list[int | float]) -> None:
+        """Launch again with these numbers."""
+        assert self.command is not None  # since it is recorded
+        for k, value in enumerate(numbers):
+            index, last = self.numbers[k]
+            if value != last:
+                self.command.set_param_at_index(index, value)
+                self.numbers[k] = index, value
+        self.command.launch()
+
+
+RECORDED_CAPACITY = 4_000
+"""Largest number of recorded launches in the cache: those of a few hundred substeps that are not captured."""
+_recorded: dict[tuple, _RecordedLaunch] = {}
+
+
+def launch_recorded(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device, block: int = 256) -> None:
+    """Launch on a GPU; the launch that Warp recorded of the same tensors is reused, since packing arguments takes longer than a launch.
+
+    Args:
+        kernel, dim, arguments, device: As for `launch`.
+        block: Threads per block.
+    """
+    key: list = [kernel, dim, device, block]
+    numbers = []
+    for value in arguments:
+        if isinstance(value, Tensor):
+            key += (value.data_ptr(), value.shape, value.stride())
+        elif isinstance(value, int | float):  # bool too
+            numbers.append(value)
+        else:
+            key.append(id(value))
+    found = _recorded.get(tuple(key))
+    if found is None:
+        with BUILDING:
+            if len(_recorded) >= RECORDED_CAPACITY:
+                _recorded.clear()
+            found = _recorded[tuple(key)] = _RecordedLaunch(kernel, dim, arguments, device, block)
+    found.run(numbers)
+
+
 def forget_launches() -> None:
-    """Empty the cache of packed launches."""
+    """Empty the caches of packed and recorded launches."""
     with BUILDING:
         _commands.clear()
+        _recorded.clear()
 
 
 def packed_launches() -> int:
-    """Return the number of packed launches in the cache."""
-    return len(_commands)
+    """Return the number of packed and recorded launches in the caches."""
+    return len(_commands) + len(_recorded)
 
 
 def _launch_cached(kernel: wp.Kernel, dim: int, arguments: Sequence, device: torch.device) -> None:

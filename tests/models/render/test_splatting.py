@@ -97,8 +97,13 @@ def test_the_kernels_of_cuda_agree_on_the_cpu(name, monkeypatch):
     """One thread a pixel, tiles of 16, keys and a sort."""
     monkeypatch.setattr(splatting, "one_thread_per_tile", lambda device: False)
     monkeypatch.setitem(splatting.TILE, "cpu", 16)
-    monkeypatch.setattr(splatting, "_lists_by_counting", lambda *found: splatting._lists_by_key(*found, None))
+    monkeypatch.setattr(splatting, "_rooms", rooms := {})
     compare(*SCENES[name])
+    for key in rooms:  # lists with room for more, and lists that turn out too short and are built again
+        for room in (2 * rooms[key] + 5, rooms[key] // 3):
+            rooms[key] = room
+            compare(*SCENES[name])
+            assert rooms[key] != room or not room
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -28,19 +28,25 @@ def add(factor: float, shift: int, twice: bool, box: wp.vec3i, x: wp.array(dtype
     out[i] = y
 
 
-def test_scalars_change_and_vectors_are_told_apart():
+@pytest.fixture(params=["launch", "launch_recorded"])
+def launch(request):
+    """Return the launch of the CPU, and that of a GPU, which runs on the CPU too."""
+    return getattr(device, request.param)
+
+
+def test_scalars_change_and_vectors_are_told_apart(launch):
     x, out = torch.arange(5.0), torch.empty(5)
     for factor, shift, twice, first in [(1.0, 0, False, 0), (2.5, 3, True, 0), (1.0, 0, False, 7), (0.5, -2, True, 7)]:
-        device.launch(add, 5, [factor, shift, twice, wp.vec3i(first, 0, 0), x, out], CPU)
+        launch(add, 5, [factor, shift, twice, wp.vec3i(first, 0, 0), x, out], CPU)
         assert torch.equal(out, (2 if twice else 1) * (factor * x + shift + first))
 
 
-def test_another_tensor_in_the_same_place_is_another_array():
+def test_another_tensor_in_the_same_place_is_another_array(launch):
     memory, out = torch.arange(12.0), torch.zeros(4)
     box = wp.vec3i(0, 0, 0)
-    device.launch(add, 4, [1.0, 0, False, box, memory[:4], out], CPU)
+    launch(add, 4, [1.0, 0, False, box, memory[:4], out], CPU)
     assert torch.equal(out, memory[:4])
-    device.launch(add, 4, [1.0, 0, False, box, memory.view(4, 3)[:, 0], out], CPU)  # the same address, another stride
+    launch(add, 4, [1.0, 0, False, box, memory.view(4, 3)[:, 0], out], CPU)  # the same address, another stride
     assert torch.equal(out, memory[::3])
 
 
@@ -62,12 +68,14 @@ def test_threads_that_meet_a_new_kernel_agree():
         assert all(pool.map(work, range(16)))
 
 
-def test_the_memory_of_launches_is_bounded(monkeypatch):
+def test_the_memory_of_launches_is_bounded(monkeypatch, launch):
     monkeypatch.setattr(device, "COMMAND_CAPACITY", 10)
+    monkeypatch.setattr(device, "RECORDED_CAPACITY", 10)
+    device.forget_launches()
     x, box, kept = torch.arange(3.0), wp.vec3i(0, 0, 0), []
     for n in range(40):
         kept.append(torch.empty(3))
-        device.launch(add, 3, [1.0, n, False, box, x, kept[-1]], CPU)
+        launch(add, 3, [1.0, n, False, box, x, kept[-1]], CPU)
     assert device.packed_launches() <= 12
     assert all(torch.equal(out, x + n) for n, out in enumerate(kept))
 
