@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def export(
     *,
     frame_interval: float | None = None,
     every: int = 1,
-    law: ElasticLaw | None = None,
+    law: ElasticLaw | Sequence[ElasticLaw] | None = None,
     scene: Scene | None = None,
     surface: bool = False,
     surface_spacing: float | None = None,
@@ -55,7 +56,7 @@ def export(
             an Alembic archive.
         frame_interval: Time between two frames [s], for a motion without times.
         every: Write every so many frames.
-        law: Elastic law of one scene, from which the field `stress` is computed.
+        law: Elastic law of one scene, or one of each body in their order, from which the field `stress` is computed.
         scene: The scene, for its planes and the direction of gravity.
         surface: Whether the surface of each body is reconstructed in each frame.
         surface_spacing: Distance between neighbouring particles of the surface [m]; found in the first frame where absent.
@@ -80,13 +81,14 @@ def export(
         raise UserError(f"path = {path}{close} its ending must be one of {', '.join(f'{end} ({what})' for end, what in FORMATS.items())}")
     if not 0 < speed < float("inf"):
         raise UserError(f"speed is {speed:g}; it must be positive, 1 for real time")
-    given = {"surface": surface, "gaussians": gaussians is not None, "cameras": cameras is not None, "law": law is not None}
+    laws = () if law is None else tuple(law) if isinstance(law, Sequence) else (law,)
+    given = {"surface": surface, "gaussians": gaussians is not None, "cameras": cameras is not None, "law": bool(laws)}
     _check_places(ending, given)
     if not isinstance(frames, Frames):
         frames = _as_frames(frames, ending, frame_interval)
     if ending in PARTICLES_ALONE:
         return _thinned(frames, every).save(target)[0]
-    made = _collected(frames, every, law, scene, surface, surface_spacing, gaussians, cameras, progress)
+    made = _collected(frames, every, laws, scene, surface, surface_spacing, gaussians, cameras, progress)
     written = _write(target, ending, made, speed, progress)
     for note in made.notes:
         warnings.warn(note, PlausibilityWarning, stacklevel=2)
@@ -107,7 +109,7 @@ def _check_places(ending: str, given: dict[str, bool]) -> None:
 def _collected(
     frames: Any,
     every: int,
-    law: ElasticLaw | None,
+    laws: Sequence[ElasticLaw],
     scene: Scene | None,
     surface: bool,
     surface_spacing: float | None,
@@ -122,7 +124,7 @@ def _collected(
     from neuido.export.splats import MovingSplats
 
     made = exchange_of(frames, every=every, scene=scene)
-    add_fields(made, law)
+    add_fields(made, laws)
     if surface:
         own = [reconstruct_surface(made, part, i, spacing=surface_spacing, progress=progress) for i, part in enumerate(made.parts)]
         made.surfaces = (*made.surfaces, *own)

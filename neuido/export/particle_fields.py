@@ -1,5 +1,7 @@
 """Quantities of the particles that are written beside their positions: volume ratio, strain, stress."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -16,40 +18,52 @@ SMALLEST = 1e-6
 """Lower bound of a principal stretch in its logarithm, and of det F as a divisor [-]."""
 
 
-def add_fields(made: Exchange, law: ElasticLaw | None = None) -> None:
-    """Add the fields that F allows: `volume_ratio`, `strain` and, with a law, `stress`.
+def add_fields(made: Exchange, laws: Sequence[ElasticLaw] = ()) -> None:
+    """Add the fields that F allows: `volume_ratio`, `strain` and, with laws, `stress`.
 
     `volume_ratio` is det F [-]. `strain` is the equivalent Hencky strain sqrt(2/3 dev ln V : dev ln V) of the elastic F [-]. `stress` is
     von Mises' equivalent of the Cauchy stress, sqrt(3/2 dev sigma : dev sigma) [Pa].
 
     Args:
         made: The motion; without F, nothing is added.
-        law: Elastic law of one scene.
+        laws: Elastic law of all bodies, or of each in their order; none: no stress.
 
     Raises:
-        UserError: There is a law and no F, or the law does not take these F.
+        UserError: There is a law and no F, a body without a law, or a law that does not take these F.
     """
     if made.F is None:
-        if law is not None:
+        if laws:
             raise UserError("the motion has no deformation gradient F, of which the law could give the stress: leave out the law")
         return
-    flat = torch.from_numpy(made.F.reshape(-1, 3, 3))
-    names = {"volume_ratio": "1", "strain": "1"} | ({} if law is None else {"stress": "Pa"})
-    values = {name: np.empty(len(flat), np.float32) for name in names}
-    for begin in range(0, len(flat), CHUNK):
-        part = slice(begin, begin + CHUNK)
-        F = flat[part].double().contiguous()
-        stretches = _stretches(F)
-        J = stretches.prod(-1)
-        strain = stretches.clamp(min=SMALLEST).log()
-        values["volume_ratio"][part] = J.numpy()
-        values["strain"][part] = (2 / 3 * (strain - strain.mean(-1, keepdim=True)).square().sum(-1)).sqrt().numpy()
-        if law is not None:
-            sigma = _kirchhoff(law, F) / J.abs().clamp(min=SMALLEST)[:, None, None]
-            mean = sigma.diagonal(dim1=-2, dim2=-1).mean(-1)
-            values["stress"][part] = (1.5 * (sigma.square().sum((-2, -1)) - 3 * mean.square()).clamp(min=0)).sqrt().numpy()
+    body = made.fields["body"].values if len(laws) > 1 and "body" in made.fields else np.zeros(made.x.shape[1], np.int32)
+    if len(laws) > 1 and int(body.max()) != len(laws) - 1:
+        raise UserError(f"law has {len(laws)} laws for the {int(body.max()) + 1} bodies of the motion: give one of all, or one of each")
+    shape = made.F.shape[:2]
+    names = {"volume_ratio": "1", "strain": "1"} | ({"stress": "Pa"} if laws else {})
+    values = {name: np.empty(shape, np.float32) for name in names}
+    for number in range(max(1, len(laws))):
+        own = np.flatnonzero(body == number)
+        for frame in range(shape[0]):
+            for begin in range(0, len(own), CHUNK):
+                part = own[begin : begin + CHUNK]
+                found = _fields(torch.from_numpy(made.F[frame, part]).double().contiguous(), laws[number] if laws else None)
+                for name in names:
+                    values[name][frame, part] = found[name].numpy()
     for name, unit in names.items():
-        made.fields[name] = Field(values[name].reshape(made.F.shape[:2]), unit)
+        made.fields[name] = Field(values[name], unit)
+
+
+def _fields(F: torch.Tensor, law: ElasticLaw | None) -> dict[str, torch.Tensor]:
+    """Return the fields of F (n, 3, 3), (n,) each."""
+    stretches = _stretches(F)
+    J = stretches.prod(-1)
+    strain = stretches.clamp(min=SMALLEST).log()
+    out = {"volume_ratio": J, "strain": (2 / 3 * (strain - strain.mean(-1, keepdim=True)).square().sum(-1)).sqrt()}
+    if law is not None:
+        sigma = _kirchhoff(law, F) / J.abs().clamp(min=SMALLEST)[:, None, None]
+        mean = sigma.diagonal(dim1=-2, dim2=-1).mean(-1)
+        out["stress"] = (1.5 * (sigma.square().sum((-2, -1)) - 3 * mean.square()).clamp(min=0)).sqrt()
+    return out
 
 
 def _stretches(F: torch.Tensor) -> torch.Tensor:

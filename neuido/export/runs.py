@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
-from neuido.data.formats.frame_files import LAW, SCENE, numbered_files, picked, read_frame_arrays, read_surfaces
+from neuido.data.formats.frame_files import numbered_files, picked, read_frame_arrays, read_frame_times, read_surfaces
 from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
+from neuido.models.inference.simulated_run import are_uniform, scene_and_laws
 from neuido.types import Scene, Skin
 
 KINDS = "a folder of `neuido simulate`, `neuido predict` or `neuido diagnose`, or a file of frames (.npz)"
@@ -24,8 +25,8 @@ class Run(NamedTuple):
     what: str
     """What it is, for the message."""
     scene: Scene | None = None
-    law: Any = None
-    """Elastic law of the simulation; None where it is not known."""
+    laws: tuple[Any, ...] = ()
+    """Elastic law of all bodies, or of each; none where they are not known or vary within a body."""
     notes: tuple[str, ...] = ()
 
 
@@ -93,8 +94,10 @@ def _frames(path: Path, frame_interval: float | None) -> Run:
     )
     v = arrays["v"] if "v" in arrays else _velocities(x, times)
     motion = SimpleNamespace(x=x, v=v, times=times, skins=skins, colliders=colliders, **own)
-    scene, law = _beside(path.parent)
-    return Run(motion, path.parent.name if path.name == "frames.npz" else path.stem, scene, law)
+    scene, laws = scene_and_laws(path.parent)
+    if len(laws) > 1 and "body" not in own:
+        laws = ()
+    return Run(motion, path.parent.name if path.name == "frames.npz" else path.stem, scene, laws if are_uniform(laws) else ())
 
 
 def _times(given: np.ndarray | None, frames: int, interval: float | None, place: Path) -> np.ndarray:
@@ -110,19 +113,6 @@ def _times(given: np.ndarray | None, frames: int, interval: float | None, place:
 def _velocities(x: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Return velocities by differences of the positions."""
     return np.zeros_like(x) if len(x) < 2 else np.gradient(x.astype(np.float64), times, axis=0).astype(np.float32)
-
-
-def _beside(folder: Path) -> tuple[Scene | None, Any]:
-    """Return the scene and the elastic law that lie beside the frames of a simulation."""
-    from neuido.data.bodies.scene_files import scene_from_dict
-
-    if not (folder / SCENE).is_file():
-        return None, None
-    content = read_yaml(folder / SCENE)
-    with naming(folder / SCENE):
-        scene = scene_from_dict(content["scene"], content["discretisation"])
-    file = folder / LAW if (folder / LAW).is_file() else folder / SCENE
-    return scene, elastic_law(file) if file.name == LAW or "model" in content else None
 
 
 def _prediction(folder: Path, recording: str | None, interval: float | None) -> Run:
@@ -142,7 +132,7 @@ def _prediction(folder: Path, recording: str | None, interval: float | None) -> 
     for name in ("x", "y", "z"):
         if name not in (tables[0].dtype.names or ()):
             raise UserError(f"{paths[0]} has no points: its vertices lack the column {name}")
-    times = _times(None, len(paths), interval, own)
+    times = _times(read_frame_times(own, len(paths)), len(paths), interval, own)
 
     def columns(*names: str) -> np.ndarray:
         return np.stack([np.stack([table[name].astype(np.float32) for name in names], axis=1) for table in tables])

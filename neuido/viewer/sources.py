@@ -8,10 +8,11 @@ import numpy as np
 
 from neuido.data.files.parsing import naming, read_arrays, read_json, read_yaml
 from neuido.data.files.values import vector
-from neuido.data.formats.frame_files import LAW, SCENE, numbered_files, picked, read_frame_arrays, read_surfaces
+from neuido.data.formats.frame_files import numbered_files, picked, read_frame_arrays, read_frame_times, read_surfaces
 from neuido.data.formats.ply import read_ply_header, read_ply_vertices
 from neuido.errors import UserError
-from neuido.types import Gaussians, Plane, Scene
+from neuido.models.inference.simulated_run import scene_and_laws
+from neuido.types import Gaussians, Plane
 from neuido.viewer.content import Content, Motion, moved_surface, place_side_by_side, skin_surface, with_scene
 from neuido.viewer.quantities import stress_by_body, stress_of
 
@@ -89,7 +90,7 @@ def _archive(path: Path, recording: str | None) -> Content:
     frames = len(x)
     given = arrays.get("times", arrays.get("t"))
     times, timed = _times(given if given is None or given.ndim == 1 else given[0], frames, path)
-    scene, laws = _beside(path.parent)
+    scene, laws = scene_and_laws(path.parent)
     body = arrays.get("body")
     stress = stress_of(laws[0]) if len(laws) == 1 else None
     if body is not None and len(laws) > 1:
@@ -125,47 +126,24 @@ def _times(given: np.ndarray | None, frames: int, path: Path) -> tuple[np.ndarra
     return given.astype(np.float64), True
 
 
-def _beside(folder: Path) -> tuple[Scene | None, list[Any]]:
-    """Return the scene and the elastic laws of its bodies that `neuido simulate` kept in a folder; None and no law where absent.
-
-    Colliders other than planes are left out: the file of frames has their surfaces.
-    """
-    from neuido.data.bodies.scene_files import model_from_dict, scene_from_dict
-    from neuido.physics.laws.classical import material
-
-    if not (folder / SCENE).is_file():
-        return None, []
-    content = read_yaml(folder / SCENE)
-    with naming(folder / SCENE):
-        own = dict(content["scene"])
-        own["colliders"] = [each for each in own.get("colliders") or [] if "plane" in (each.get("kind"), each.get("type"))]
-        scene = scene_from_dict(own, content["discretisation"])
-        if (folder / LAW).is_file():
-            from neuido.models.inference.law_file import load_law
-
-            return scene, [load_law(folder / LAW)[0]]
-        models = [model_from_dict(each["model"]) for each in content.get("bodies") or [content]]
-        return scene, [material(model["elasticity"], model["plasticity"])[0] for model in models]
-
-
 def _ply_series(paths: Sequence[Path]) -> Content:
     """Read one PLY file a frame, of particles or of Gaussians."""
     if not paths:
         raise UserError("the folder of particles holds no numbered PLY files")
     title = paths[0].parent.name if len(paths) > 1 else paths[0].stem
     title = paths[0].parents[1].name if title in ("particles", "ply") else title
-    times = np.arange(len(paths)) / RATE
+    times, timed = _times(read_frame_times(paths[0].parent, len(paths)), len(paths), paths[0].parent)
     if _has_gaussians(paths[0]):
         from neuido.models.render.gaussians import load_ply
 
         series: list[Gaussians] = [load_ply(path, device="cpu") for path in paths]
-        return Content(title, gaussians=series, times=times, timed=False)
+        return Content(title, gaussians=series, times=times, timed=timed)
     tables = [_points(path) for path in paths]
     if len({len(table) for table in tables}) > 1:
         raise UserError(f"{paths[0].parent}: the files have different numbers of particles: give a folder of one motion")
     x = np.stack([table[:, :3] for table in tables])
     v = np.stack([table[:, 3:] for table in tables]) if tables[0].shape[1] == 6 else None
-    return Content(title, [Motion("particles", times, x, v)], times=times, timed=False)
+    return Content(title, [Motion("particles", times, x, v)], times=times, timed=timed)
 
 
 def _has_gaussians(path: Path) -> bool:

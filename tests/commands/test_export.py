@@ -109,3 +109,33 @@ def test_what_cannot_be_exported_is_one_line(words, line, runs, capsys):
     status, _, err = run(capsys, "export", *words.format(**paths).split())
     assert status == 2 and line in err and err.count("\n") == 1
     assert not (runs / "new").exists()
+
+
+def test_stress_is_that_of_each_bodys_law(runs, capsys):
+    law = "{density: 1000.0, elasticity: {law: sigma, young: %s, poisson: 0.3}, plasticity: {law: identity}}"
+    bodies = ", ".join(f"{{name: b{i}, model: {law % young}}}" for i, young in enumerate(("1.0e+5", "3.0e+5")))
+    room = "domain: [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], gravity: [0.0, -9.8, 0.0]"
+    scene = f"format: neuido-scene/1\nscene: {{{room}}}\ndiscretisation: {{grid: 20, dt: 1.0e-4}}\nbodies: [{bodies}]\n"
+    (runs / "simulated" / "scene.yaml").write_text(scene)
+    F = np.tile(np.diag([1.2, 1.0, 1.0]).astype(np.float32), (K, P, 1, 1))
+    np.savez(runs / "simulated" / "frames.npz", x=X, F=F, times=DT * np.arange(K), body=np.arange(P, dtype=np.int32) % 2)
+    status, _, told = run(capsys, "export", runs / "simulated", "--to", "ply", "--out", runs / "s.ply")
+    assert status == 0, told
+    stress = read_ply_vertices(runs / "s_0001.ply")["stress"]
+    assert stress[0] > 1e3 and stress == pytest.approx(np.tile([stress[0], 3 * stress[0]], P // 2), rel=1e-5)
+
+
+def test_predictions_have_the_times_of_their_frames(runs, capsys):
+    from neuido.models import write_particles
+    from neuido.types import ParticleState
+
+    state = ParticleState(torch.from_numpy(X), torch.zeros(K, P, 3), None, None)
+    folder = runs / "timed" / "ball" / "particles"
+    write_particles(folder, state, torch.tensor([0.0, 0.04, 0.08]))
+    status, _, told = run(capsys, "export", runs / "timed", "--to", "npz", "--out", runs / "t.npz")
+    assert status == 0, told
+    with np.load(runs / "t.npz") as archive:
+        assert archive["times"] == pytest.approx([0.0, 0.04, 0.08])
+    (folder / "times.csv").write_text("frame,time [s]\n0,0\n1,soon\n2,0.08\n")
+    status, _, told = run(capsys, "export", runs / "timed", "--to", "npz", "--out", runs / "u.npz")
+    assert status == 2 and "times.csv must have two columns of numbers" in told

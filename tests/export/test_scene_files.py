@@ -330,7 +330,7 @@ def test_frames_save_themselves_in_every_format_with_their_colliders(tmp_path):
     (path,) = frames.save(tmp_path / "a.usd")
     (archive,) = frames.save(tmp_path / "a.npz")
     again = neuido.export(read_run(archive).motion, tmp_path / "again.usd")
-    for each, name in ((path, "sphere_1"), (again, "collider_1")):
+    for each, name in ((path, "sphere_1"), (again, "collider_0")):
         stage = Usd.Stage.Open(str(each))
         prim = stage.GetPrimAtPath(f"/World/colliders/{name}")
         assert np.array(UsdGeom.Xformable(prim).GetLocalTransformation(2))[3, :3] == pytest.approx([0.21, 0.2, 0.2])

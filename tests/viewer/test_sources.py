@@ -77,6 +77,8 @@ def test_point_clouds_and_gaussians_of_frames(tmp_path):
 def test_predictions_of_several_scenes(tmp_path):
     for name in ("duck", "cat"):
         frames().save(tmp_path / "runs" / name / "particles" / "f.ply")
+    (tmp_path / "runs" / "duck" / "particles" / "times.csv").write_text("frame,time [s]\n0,0\n1,0.01\n2,0.02\n3,0.03\n")
+    assert read_content(tmp_path / "runs", "duck").times == pytest.approx([0.0, 0.01, 0.02, 0.03])
     assert read_content(tmp_path / "runs").notes == ["one of 2: --recording chooses from cat, duck"]
     assert not read_content(tmp_path / "runs", "duck").notes
     with pytest.raises(UserError, match=r"recording = 'dck'.*duck"):

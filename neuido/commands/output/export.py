@@ -118,9 +118,9 @@ def _motion(
     from neuido.export.runs import elastic_law, read_run
 
     run = read_run(source, recording=recording, when=when, frame_interval=frame_interval)
-    chosen = run.law if law is None else elastic_law(Path(law))
+    chosen = run.laws if law is None else (elastic_law(Path(law)),)
     if target.suffix.lower() in (".npz", ".csv") and law is None:
-        chosen = None
+        chosen = ()
     if gaussians is not None:
         from neuido.models.render.gaussians import load_ply
 

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from neuido.data.files.parsing import read_arrays
+from neuido.data.files.parsing import read_arrays, read_table
 from neuido.errors import UserError, suggest
 
 SCENE, LAW = "scene.yaml", "law.safetensors"
 """Files that `neuido simulate` writes beside the frames: the scene with its model, and a learned law."""
+TIMES = "times.csv"
+"""File beside numbered PLY files: number and time [s] of each frame."""
 SURFACES = {"skin": ("vertices", "faces", "indices", "weights"), "collider": ("vertices", "faces", "poses")}
 """Arrays of each skin and collider in a file of frames."""
 MOST_SURFACES = 64
@@ -74,6 +76,25 @@ def numbered_files(folder: Path) -> list[Path]:
     """Return the PLY files of a folder whose names end in a number, in its order."""
     found = [(int(match[1]), path) for path in folder.glob("*.ply") if (match := re.search(r"(\d+)$", path.stem))]
     return [path for _, path in sorted(found)]
+
+
+def read_frame_times(folder: Path, frames: int) -> np.ndarray | None:
+    """Return the times beside the PLY files of a folder [s], (frames,) float64; None without a file of times.
+
+    Raises:
+        UserError: A file with other columns, or whose times are not one a frame, finite and rising.
+    """
+    path = folder / TIMES
+    if not path.is_file():
+        return None
+    try:
+        table = np.array([[float(cell) for cell in row] for row in read_table(path)[1:]]).reshape(-1, 2)
+    except ValueError as error:
+        raise UserError(f"{path} must have two columns of numbers, the number and the time of a frame [s]") from error
+    times = table[:, 1]
+    if len(times) != frames or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise UserError(f"{path}: it has {len(times)} times for {frames} frames; they must be finite and rise")
+    return times
 
 
 def picked(names: Sequence[str], wanted: str | None, place: Path) -> str:

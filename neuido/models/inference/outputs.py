@@ -9,14 +9,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.files.writing import atomic_write, write_png
+from neuido.data.files.writing import atomic_write, write_png, write_text
+from neuido.data.formats.frame_files import TIMES
 from neuido.data.formats.ply import ply_bytes
 from neuido.errors import UserError
 from neuido.types import ParticleState
 
 
-def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
-    """Write the particles of each frame to `000.ply`, `001.ply`, ... with x, y, z [m] and vx, vy, vz [m/s]."""
+def write_plys(folder: str | os.PathLike, motion: ParticleState, times: Tensor | None = None) -> None:
+    """Write the particles of each frame to `000.ply`, `001.ply`, ... with x, y, z [m] and vx, vy, vz [m/s].
+
+    Args:
+        folder: Folder of the files, made if it is not there.
+        motion: The particles.
+        times: Times of the frames [s], (K,), written to `times.csv`.
+    """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     x, v = motion.x.detach().cpu().numpy(), motion.v.detach().cpu().numpy()
@@ -29,6 +36,10 @@ def write_plys(folder: str | os.PathLike, motion: ParticleState) -> None:
     for old in folder.glob("*.ply"):  # left by an earlier, longer run
         if old.stem.isdigit() and int(old.stem) >= len(x):
             old.unlink()
+    if times is None:
+        (folder / TIMES).unlink(missing_ok=True)
+    else:
+        write_text(folder / TIMES, "frame,time [s]\n" + "".join(f"{k},{time:.9g}\n" for k, time in enumerate(times.tolist())))
 
 
 def write_video(path: str | os.PathLike, images: Tensor, *, rate: float = 20.0) -> None:

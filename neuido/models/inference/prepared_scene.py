@@ -68,6 +68,10 @@ class PreparedScene(NamedTuple):
         """Return the number of substeps from the first to the last of `frames` frames."""
         return self.every * (frames - 1 if self.recorded_frames is None else self.recorded_frames[frames - 1])
 
+    def times(self, frames: int) -> Tensor:
+        """Return the times since the first frame of the first `frames` recorded frames [s], (frames,) float64."""
+        return self.source.scene.dt * torch.tensor([self.substeps(k + 1) for k in range(frames)], dtype=torch.float64)
+
     @property
     def scoring_views(self) -> list[int]:
         """Indices of the held-out views, or of all views if none is held out."""

@@ -32,7 +32,8 @@ from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.render.gaussians import attach_gaussians, bind, colours_of, deform
 from neuido.models.render.splatting import render
 from neuido.physics.mpm.simulator import Simulator
-from neuido.types import Body, Gaussians, ParticleState, Vector
+from neuido.physics.runtime.frames import Frames
+from neuido.types import Body, Gaussians, Vector
 
 FORMAT = "neuido-conditions/1"
 ZERO = (0.0, 0.0, 0.0)
@@ -96,7 +97,7 @@ def _body(entry: Any, where: str) -> BodyCondition:
     return BodyCondition(entry["of"], **vectors, shape=shape)
 
 
-def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]]) -> tuple[ParticleState, Gaussians, PreparedScene]:
+def simulate_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]]) -> tuple[Frames, Gaussians, PreparedScene]:
     """Simulate a condition.
 
     Args:
@@ -145,7 +146,7 @@ def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]],
     with torch.no_grad():
         images = render(gaussians, first.views([first.scoring_views[0]]), background=first.background)[0][:, 0]
     folder = folder_of(out, f"condition-{condition.name}")
-    write_plys(folder / "particles", motion)
+    write_plys(folder / "particles", motion, motion.times)
     write_video(folder / "video.mp4", images)
     contact_sheet(folder / "video.png", [images])
     return folder

@@ -130,6 +130,6 @@ def write_prediction(folder: Path, prepared: PreparedScene, motion: ParticleStat
     """Write the particles, and a video and contact sheet that compare recorded and predicted frames in one scoring view."""
     view = prepared.scoring_views[0]
     images, recorded = render_motion(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
-    write_plys(folder / "particles", motion)
+    write_plys(folder / "particles", motion, prepared.times(len(motion.x)))
     write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
     contact_sheet(folder / "prediction.png", [recorded, images])
