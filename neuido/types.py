@@ -183,11 +183,20 @@ class Cameras(NamedTuple):
     """V pinhole cameras of one image size. Pixel (i, j) covers [j, j + 1) x [i, i + 1), so its centre lies at j + 0.5, i + 0.5."""
 
     viewmats: Tensor
-    """World to camera in OpenCV axes (x right, y down, z forward) [m], (V, 4, 4)."""
+    """World to camera in OpenCV axes (x right, y down, z forward) [m], (V, 4, 4); (V, T, 4, 4) for cameras that move in T frames."""
     Ks: Tensor
     """Intrinsics [px], (V, 3, 3)."""
     width: int
     height: int
+
+    @property
+    def moving(self) -> bool:
+        """Whether there is a pose for each frame."""
+        return self.viewmats.dim() == 4
+
+    def at(self, frame: int) -> "Cameras":
+        """Return the cameras in one frame; fixed cameras are the same in all."""
+        return self._replace(viewmats=self.viewmats[:, frame]) if self.moving else self
 
     def __repr__(self) -> str:
         return brief_fields(self)

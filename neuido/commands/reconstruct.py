@@ -96,6 +96,7 @@ def reconstruct(
     chosen = choose_device(device)
     around = _setting(source, setting, recording, scale, shift, up)
     batch = load_views(source, placing=around.placing, recording=recording, frame_interval=frame_interval, frame_count=1, width=width)
+    batch = batch._replace(cameras=batch.cameras.at(0))
     if (trained := int((~batch.held_out).sum())) < 2:
         raise UserError(f"{source} has {trained} views to train on; a reconstruction needs at least two")
     plan = {key: value for key, value in options.items() if key not in ("out", "device", "progress", "save_every", "folder")}

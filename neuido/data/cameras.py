@@ -186,7 +186,10 @@ def orbit(
 
 
 def project(points: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
-    """Project points [m] (N, 3) to pixels x, y (V, N, 2) and depths [m] (V, N); points at depth <= 0 are behind the camera."""
+    """Project points [m] (N, 3) to pixels x, y (V, N, 2) and depths [m] (V, N); points at depth <= 0 are behind the camera.
+
+    Of cameras that move choose a frame first (`Cameras.at`).
+    """
     viewmats, Ks = cameras.viewmats.to(points.dtype), cameras.Ks.to(points.dtype)
     seen = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     image = seen @ Ks.mT
@@ -197,6 +200,23 @@ def select(cameras: Cameras, views: Sequence[int]) -> Cameras:
     """Select cameras by index, in the given order."""
     chosen = torch.as_tensor(list(views), dtype=torch.long, device=cameras.viewmats.device)
     return cameras._replace(viewmats=cameras.viewmats[chosen], Ks=cameras.Ks[chosen])
+
+
+def select_frames(cameras: Cameras, frames: Sequence[int]) -> Cameras:
+    """Select the poses of frames, in the given order; fixed cameras stay as they are."""
+    return cameras._replace(viewmats=cameras.viewmats[:, list(frames)]) if cameras.moving else cameras
+
+
+def refuse_moving(cameras: Cameras, name: str, what: str) -> None:
+    """Raise UserError if cameras move, where only fixed ones can be used.
+
+    Args:
+        cameras: The cameras.
+        name: What has these cameras, for the message.
+        what: What needs fixed cameras, and what to do instead.
+    """
+    if cameras.moving:
+        raise UserError(f"{name} has cameras that move (a pose for each frame): {what}")
 
 
 def resize(cameras: Cameras, width: int, height: int) -> Cameras:
@@ -226,8 +246,8 @@ def move(cameras: Cameras, *, scale: float = 1.0, rotation: Tensor | None = None
         raise UserError(f"scale must be positive, got {scale}")
     old = cameras.viewmats.double()
     R = torch.eye(3, dtype=torch.float64, device=old.device) if rotation is None else rotation.to(old)
-    turned = old[:, :3, :3] @ R.mT
-    t = scale * old[:, :3, 3:] - turned @ old.new_tensor(shift)[:, None]
+    turned = old[..., :3, :3] @ R.mT
+    t = scale * old[..., :3, 3:] - turned @ old.new_tensor(shift)[:, None]
     return cameras._replace(viewmats=_rigid(turned, t).to(cameras.viewmats))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from neuido.data.cameras import refuse_moving
 from neuido.errors import PlausibilityWarning, UserError, suggest
 from neuido.physics.laws.base import ElasticLaw
 from neuido.types import Cameras, Gaussians, Scene
@@ -132,6 +133,8 @@ def _collected(
         if made.F is None:
             raise UserError("the motion has no deformation gradient F, with which the Gaussians could deform: leave out gaussians")
         made.gaussians = MovingSplats(gaussians, made.x, made.F)
+    if cameras is not None:
+        refuse_moving(cameras, "the recording", "only fixed ones are written; leave --cameras out, or give cameras.at(frame)")
     made.cameras = cameras
     return made
 

@@ -217,7 +217,7 @@ def _gaussians(path: Path) -> Gaussians:
 
 def _add_views(content: Content, found: Any) -> None:
     """Add cameras and images; frames are those of the motion where there is one, else those of the images."""
-    content.cameras, content.views = found.cameras, found.views
+    content.cameras, content.views = found.cameras.at(0), found.views
     recorded = found.times.double().numpy()
     if content.frames == 1 and len(recorded) > 1:
         content.times = recorded - recorded[0]

@@ -81,11 +81,19 @@ def experiment(
 
 
 def filmed(
-    folder: Path, effects: dict[str, float], *, particles: bool = True, views: int = 2, frames: int = 14, width: int = 96, side: int = 5
-) -> Experiment:
-    """Write the block of `experiment` as silhouettes from some views, a throw and one held out; `particles`: with x0, v0 and volume."""
+    folder: Path, effects: dict[str, float], *, particles: bool = True, views: int = 2, frames: int = 14, width: int = 96, side: int = 5,
+    turn: float = 0.0,
+) -> Experiment:  # fmt: skip
+    """Write the block of `experiment` as silhouettes from some views, a throw and one held out; `particles`: with x0, v0 and volume.
+
+    `turn` [degrees] is the angle by which the cameras turn about the body from the first frame to the last.
+    """
     scene = Scene(cells=14, dt=1e-3, colliders=(Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0), "separate", 0.2),))
-    cameras = orbit(views, radius=2.4, elevations=(12.0, 50.0), target=(0.5, 0.35, 0.5), width=width, height=width, angle=32.0)
+    options = {"radius": 2.4, "elevations": (12.0, 50.0), "target": (0.5, 0.35, 0.5), "width": width, "height": width, "angle": 32.0}
+    cameras = orbit(views, **options)
+    if turn:
+        poses = [orbit(views, start=float(start), **options).viewmats for start in np.linspace(0.0, turn, frames)]
+        cameras = cameras._replace(viewmats=torch.stack(poses, 1))
     recordings = []
     for name, role, b in (
         ("throw", "fit", body((0.9, 0.6, 0.2), 5.0, 0.42, side)),

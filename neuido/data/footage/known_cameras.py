@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from neuido.data import cameras as convert
 from neuido.data.files.writing import write_png
 from neuido.data.footage.filming import SAME_ASPECT, Filming, View, chosen_frames
 from neuido.data.footage.video_frames import Clip, images
@@ -63,6 +64,7 @@ def reconstructed_cameras(clips: Sequence[Clip], filming: Filming) -> tuple[list
 
 
 def _of_views(found: MultiView, clips: Sequence[Clip], option: str) -> list[View]:
+    convert.refuse_moving(found.cameras, option, "clips need one pose for each view; give a recording of fixed cameras")
     stems = {Path(view).stem: v for v, view in enumerate(found.views)} | {view: v for v, view in enumerate(found.views)}
     views = []
     for clip in clips:

@@ -1,14 +1,16 @@
 """Reader of COLMAP models, binary (`cameras.bin`, `images.bin`) or text (`cameras.txt`, `images.txt`).
 
-A model holds views of one moment. `colmap image_undistorter` writes it to `sparse/`, `colmap mapper` to `sparse/0/`. Spring-Gaus and
-NeuMA have binary models. Masks lie in `masks/`. A mask is named `<image name>.png`, as COLMAP does, or as its image with the suffix `.png`.
+A model holds views of one moment or, if the time between frames is given, the frames of cameras that move. `colmap image_undistorter`
+writes it to `sparse/`, `colmap mapper` to `sparse/0/`. Spring-Gaus and NeuMA have binary models. Masks lie in `masks/`. A mask is named
+`<image name>.png`, as COLMAP does, or as its image with the suffix `.png`.
 """
 
 import contextlib
 import math
+import re
 import struct
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import torch
@@ -157,26 +159,30 @@ def find_model(path: Path) -> Path | None:
 
 
 def read(path: Path, *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
-    """Read a COLMAP project as views of one moment.
+    """Read a COLMAP project as views of one moment or, with `frame_interval`, as frames of cameras that move.
 
     Args:
         path: The project folder. The model lies in `sparse/0`, `sparse` or the folder itself, images lie in `images`, and masks, if there
             are any, in `masks`.
         recording: Not used.
-        frame_interval: Not used.
+        frame_interval: Time between frames [s]. The images of one folder, or of one of COLMAP's cameras if all lie in one folder, are then
+            the frames of a view. The last number in the name of an image is that of its frame.
 
     Raises:
-        UserError: There is no model, a camera model is not a pinhole, an image is missing, or some images have a mask and others none.
+        UserError: There is no model, a camera model is not a pinhole, an image is missing, or some images have a mask and others none. With
+            `frame_interval`, an image has no number, or two images of a view have the same.
     """
     model = find_model(path)
     if model is None:
         raise UserError(f"{path} has no COLMAP model: neither it nor sparse nor sparse/0 has images.bin or images.txt")
     masks = path / "masks" if (path / "masks").is_dir() else None
-    return views(model, path / "images", folder=path, name=path.resolve().name, masks=masks)
+    return views(model, path / "images", folder=path, name=path.resolve().name, masks=masks, frame_interval=frame_interval)
 
 
-def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path | None = None) -> MultiView:
-    """Read the registered images of a model folder; each image is one view.
+def views(
+    model: Path, pictures: Path, *, folder: Path, name: str, masks: Path | None = None, frame_interval: float | None = None
+) -> MultiView:
+    """Read the registered images of a model folder; each image is one view, or a frame of one.
 
     Args:
         model: Folder with `cameras` and `images`, .bin or .txt.
@@ -184,6 +190,7 @@ def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path |
         folder: Folder of the recording, for `MultiView.folder`.
         name: Name of the recording.
         masks: Folder of the mask files, if there are any.
+        frame_interval: As for `read`.
 
     Raises:
         UserError: As `read`.
@@ -192,14 +199,33 @@ def views(model: Path, pictures: Path, *, folder: Path, name: str, masks: Path |
     cameras, images = model / f"cameras.{kind}", model / f"images.{kind}"
     lenses = read_cameras(cameras)
     shots = []
-    for image in read_images(images):
+    found = read_images(images)
+    places = _frames_of_videos(found, images, frame_interval) if frame_interval else {image.name: (image.name, 0.0) for image in found}
+    for image in found:
         if image.camera not in lenses:
             raise UserError(f"{images}: {image.name} refers to camera {image.camera}, which is not in {cameras.name}")
         lens = lenses[image.camera]
         file = path_inside(pictures, image.name, f"{images}: name")
         mask = None if masks is None else _mask(masks, image.name)
-        shots.append(Shot(image.name, 0.0, file, image.viewmat, lens.K, mask, lens.distortion, (lens.width, lens.height)))
+        shots.append(Shot(*places[image.name], file, image.viewmat, lens.K, mask, lens.distortion, (lens.width, lens.height)))
     return assemble(shots, folder=folder, name=name, format="colmap")
+
+
+def _frames_of_videos(images: Sequence[Image], path: Path, frame_interval: float) -> dict[str, tuple[str, float]]:
+    """Return the view and the time [s] of each image by its name: its folder or camera, and its number from the first times the interval.
+
+    COLMAP leaves out images that it cannot place; the numbers keep the times of the others right.
+    """
+    folders = {str(PurePosixPath(image.name).parent) for image in images}
+    numbers: dict[str, tuple[str, int]] = {}
+    for image in images:
+        digits = re.findall(r"[0-9]+", PurePosixPath(image.name).stem)
+        if not digits:
+            raise UserError(f"{path}: {image.name} has no number in its name; with frame_interval, the last number is that of its frame")
+        view = str(PurePosixPath(image.name).parent) if len(folders) > 1 else str(image.camera)
+        numbers[image.name] = view, int(digits[-1])
+    first = min((number for _, number in numbers.values()), default=0)
+    return {name: (view, (number - first) * frame_interval) for name, (view, number) in numbers.items()}
 
 
 def _mask(masks: Path, name: str) -> Path:

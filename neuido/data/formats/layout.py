@@ -17,7 +17,7 @@ from neuido.types import Body, Cameras
 
 SAME_TIME = 1e-6  # s
 SAME_SHAPE = 0.01  # relative difference of two aspect ratios
-SAME_POSE = 1e-5  # absolute difference of the entries of two world-to-camera matrices
+SAME_POSE = 1e-5  # absolute difference of the entries of two world-to-camera matrices, below which a camera stands still
 
 Grid = tuple[tuple[Path | None, ...], ...]
 
@@ -30,6 +30,7 @@ class MultiView:
     format: str
     folder: Path
     cameras: Cameras
+    """The V cameras; with a pose for each of the T frames if one of them moves."""
     views: tuple[str, ...]
     """Names of the V views."""
     times: Tensor
@@ -76,8 +77,8 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
         fields: The other fields of `MultiView`. `held_out` holds names of views; `backgrounds` maps names of views to paths.
 
     Raises:
-        UserError: There is no image, a file is missing, two images have the same view and frame, the camera of a view moves, or views
-            have different aspect ratios.
+        UserError: There is no image, a file is missing, two images have the same view and frame, the lens of a view changes, or views have
+            different aspect ratios.
     """
     if not shots:
         raise UserError(f"{folder} lists no image")
@@ -89,6 +90,7 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
     times, at = _frames(shots)
     first: dict[str, Shot] = {}
     grid: dict[tuple[str, int], Shot] = {}
+    moves = False
     for shot, frame in zip(shots, at):
         key = (shot.view, int(frame))
         if key in grid:
@@ -99,13 +101,15 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
             raise UserError(
                 f"view {shot.view} has images of two sizes: {camera.image.name} {camera.size} and {shot.image.name} {shot.size} px"
             )
-        if not (torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE) and torch.allclose(camera.K, shot.K)):
+        if not torch.allclose(camera.K, shot.K) or camera.distortion != shot.distortion:
             raise UserError(
-                f"the camera of view {shot.view} moves between {camera.image.name} and {shot.image.name}: make each pose a separate view"
+                f"the lens of view {shot.view} changes between {camera.image.name} and {shot.image.name}: film without zoom and give all "
+                "frames of a view one focal length, centre and distortion, or make them separate views"
             )
+        moves = moves or not torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE)
     width, height = size or first[views[0]].size or image_size(shots[0].image)
     cameras = Cameras(
-        torch.stack([first[view].viewmat for view in views]).float(),
+        _poses(grid, views, len(times)) if moves else torch.stack([first[view].viewmat for view in views]).float(),
         torch.stack([_resized(first[view], width, height) for view in views]).float(),
         width,
         height,
@@ -132,6 +136,15 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
         backgrounds=tuple(backgrounds.get(view) for view in views) if backgrounds else None,
         **fields,
     )
+
+
+def _poses(grid: dict[tuple[str, int], Shot], views: Sequence[str], frames: int) -> Tensor:
+    """Return the pose of each view in each frame, (V, T, 4, 4) float32; a frame without an image has the pose of the nearest with one."""
+    out = []
+    for view in views:
+        own = [frame for frame in range(frames) if (view, frame) in grid]
+        out += [grid[view, min(own, key=lambda other: abs(other - frame))].viewmat for frame in range(frames)]
+    return torch.stack(out).float().unflatten(0, (len(views), frames))
 
 
 def _frames(shots: Sequence[Shot]) -> tuple[list[float], list[int]]:

@@ -1,7 +1,8 @@
 """Reader and writer of Nerfstudio's `transforms.json`; reader of Blender's `transforms_{train,val,test}.json` (NeRF, D-NeRF, GIC).
 
-neuido adds two keys to a frame: `time` [s] and `view`, the number of the camera. Frames without `view` belong to the same view if they
-have the same pose. If frames have neither key, each pose is a view of the same moment.
+neuido adds two keys to a frame: `time` [s] and `view`, the number of the camera. The frames of a view may have different poses: the camera
+moves. Frames without `view` belong to the same view if they have the same pose. If all poses differ and no folder has two images of one
+time, each folder holds the images of a camera that moves. If frames have neither key, each pose is a view of the same moment.
 """
 
 from collections.abc import Sequence
@@ -63,6 +64,8 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
             if shot.image not in seen:  # all three files of GIC list the test views
                 shots.append(shot)
             seen.add(shot.image)
+    if len(poses) == len(shots):
+        shots, held_out = _moving_cameras(shots, held_out)
     shots = sorted(_timed(shots, frame_interval, folder), key=lambda shot: natural_key(shot.view))
     return assemble(shots, folder=folder, held_out=held_out, name=folder.resolve().name, format="nerfstudio")
 
@@ -80,7 +83,7 @@ def write(
 
     Args:
         folder: Output folder; it is created if it does not exist.
-        cameras: V cameras.
+        cameras: V cameras, fixed or with a pose for each of the T frames.
         times: Times of the frames [s], (T,).
         images: images[v][t] is an RGB or RGBA image (H, W, 3 or 4) uint8. Images are accessed one by one, so the sequence may load lazily.
         views: Names of the views; the format requires whole numbers. Default: 0, 1, ...
@@ -110,7 +113,8 @@ def write_transforms(
         lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
         for t, time in enumerate(times.tolist()):
             relative = f"images/{name}_{t:03d}.png"
-            frames.append({"file_path": relative, **lens, "transform_matrix": poses[v], "time": time, "view": int(name)})
+            pose = poses[v][t] if cameras.moving else poses[v]
+            frames.append({"file_path": relative, **lens, "transform_matrix": pose, "time": time, "view": int(name)})
     content: dict[str, Any] = {"camera_model": "OPENCV", "w": cameras.width, "h": cameras.height, "frames": frames}
     if held_out:
         kept = {int(names[v]) for v in held_out}
@@ -228,6 +232,29 @@ def _image(folder: Path, given: Any, where: str) -> Path:
     if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
         return path
     return next((path.with_name(path.name + end) for end in ENDINGS if path.with_name(path.name + end).is_file()), path)
+
+
+def _moving_cameras(shots: list[Shot], held_out: set[str]) -> tuple[list[Shot], set[str]]:
+    """Make the images of a folder one view where all poses differ, and a folder has at most one image of a time.
+
+    Args:
+        shots: Images with known times that name no view, and of which no two have the same pose.
+        held_out: Names of the views that are held out. A folder is held out if all its images are; one of which some are stays as it is.
+
+    Returns:
+        The shots and the views that are held out, as given if the images are no frames of moving cameras.
+    """
+    folders: dict[Path, list[Shot]] = {}
+    for shot in shots:
+        folders.setdefault(shot.image.parent, []).append(shot)
+    groups = [folders[folder] for folder in sorted(folders, key=lambda folder: natural_key(str(folder)))]
+    if any(len({shot.time for shot in group}) < len(group) or np.isnan([shot.time for shot in group]).any() for group in groups):
+        return shots, held_out
+    kept = [{shot.view in held_out for shot in group} for group in groups]
+    if len(shots) == len(groups) or any(len(answers) > 1 for answers in kept):
+        return shots, held_out
+    named = [shot._replace(view=str(v)) for v, group in enumerate(groups) for shot in group]
+    return named, {str(v) for v, answers in enumerate(kept) if True in answers}
 
 
 def _timed(shots: list[Shot], frame_interval: float | None, folder: Path) -> list[Shot]:

@@ -114,7 +114,7 @@ def _views(found: MultiView) -> list[Finding]:
     if count < VIEWS_ADVISED:
         wrong = count < VIEWS_NEEDED
         out.append(Finding("views", wrong, f"{count} to train on; {VIEWS_NEEDED} are needed, {VIEWS_ADVISED} are clearly better"))
-    ahead = found.cameras.viewmats[:, 2, :3].double()
+    ahead = found.cameras.at(0).viewmats[:, 2, :3].double()
     angle = math.degrees(math.acos(float((ahead @ ahead.T).min().clamp(-1, 1))))
     if len(found.views) > 1 and angle < NARROW:
         out.append(Finding("views", False, f"all look within {angle:.0f} degrees: film from several sides"))

@@ -103,7 +103,7 @@ class SceneViews:
         self.times = found.times[self.frames] - found.times[self.frames[0]]
         size = (width or found.cameras.width, round(found.cameras.height * (width or found.cameras.width) / found.cameras.width))
         moved = convert.move(found.cameras, scale=scale, rotation=torch.tensor(UP[up]).double(), shift=shift)
-        self.cameras = convert.select(convert.resize(moved, *size), self.chosen)
+        self.cameras = convert.select(convert.select_frames(convert.resize(moved, *size), self.frames), self.chosen)
         self._kept: dict[tuple[int, int], np.ndarray] = {}
 
     @property

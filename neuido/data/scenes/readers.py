@@ -37,7 +37,7 @@ def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None
     Args:
         path: Folder of the recording; for `nerfstudio` also a JSON file.
         format: `experiment`, `pacnerf`, `neuma` (synthetic and real), `springgaus` (mpm_synthetic and real_capture), `nerfstudio` (also
-            Blender), `colmap` (one frame), or `auto` to detect it.
+            Blender), `colmap` (one frame, or with `frame_interval` frames of cameras that move), or `auto` to detect it.
         recording: Recording to read, if the folder has several: its name (experiment) or `<object>/<sequence>` (springgaus).
         frame_interval: Time between frames [s], for formats without times; it replaces the times of other formats.
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuido.data.bodies.shapes import rigid_velocity
-from neuido.data.cameras import project
+from neuido.data.cameras import project, select_frames
 from neuido.data.measured.experiment import Experiment, Recording
 from neuido.data.scenes.filmed_scene import RECONSTRUCTION, read_body, read_motion
 from neuido.data.scenes.masks import masks_from_background
@@ -52,7 +52,7 @@ class Film(NamedTuple):
     cut: np.ndarray
     """Rectangle of the recorded image in the cropped image of each view [px]: left, top, right, bottom, (V, 4)."""
     cameras: Cameras
-    """Cameras of the cropped images."""
+    """Cameras of the cropped images, fixed or with a pose for each of the T frames."""
     times: Tensor
     """Times of the frames [s], (T,) float64."""
     factor: float
@@ -103,7 +103,7 @@ def look_of(body: Body, film: Film, device: str) -> Look:
     """Return Gaussians for the particles of a body: eight for each, or one where a particle is smaller than `FINE`."""
     volume = body.volume.double() if body.F is None else body.volume.double() / torch.linalg.det(body.F.double())
     edge = volume.pow(1 / 3).float()
-    _, depth = project(body.x.float(), film.cameras)
+    _, depth = project(body.x.float(), film.cameras.at(0))
     pixels = float(edge.mean() * film.cameras.Ks[:, 0, 0].max() / depth.mean(dim=1).clamp(min=1e-6).min())
     corners = torch.tensor([[0.0] * 3]) if pixels < FINE else INSIDE * torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     spread = (0.45 if pixels < FINE else SPREAD) * edge
@@ -130,7 +130,7 @@ def read_film(experiment: Experiment, recording: Recording) -> Film:
         raise UserError(f"recording {recording.name}: its first frame shows no object: give an alpha channel, masks or a plain background")
     cut, boxes, factor, size = _boxes(masks)
     times = views.times[frames]
-    cameras = _cameras(views.cameras, boxes, size)
+    cameras = _cameras(select_frames(views.cameras, frames), boxes, size)
     return Film(_cut_out(masks, boxes, size), cut, cameras, times, factor, tuple(views.views))
 
 
@@ -240,9 +240,10 @@ def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
 def _velocity(masks: np.ndarray, cameras: Cameras, times: np.ndarray, gravity: np.ndarray) -> np.ndarray:
     """Estimate the velocity at t = 0 [m/s], (3,), of a body in free flight, by the rays through the centroids of its silhouettes."""
     path = []
-    rotation, shift = cameras.viewmats[:, :3, :3].double().numpy(), cameras.viewmats[:, :3, 3].double().numpy()
-    eyes = -np.einsum("vba,vb->va", rotation, shift)
-    for frame in masks:
+    for t, frame in enumerate(masks):
+        viewmats = cameras.at(t).viewmats
+        rotation, shift = viewmats[:, :3, :3].double().numpy(), viewmats[:, :3, 3].double().numpy()
+        eyes = -np.einsum("vba,vb->va", rotation, shift)
         normal, right = np.zeros((3, 3)), np.zeros(3)
         for mask, K, R, eye in zip(frame, cameras.Ks.double().numpy(), rotation, eyes, strict=True):
             if usable(mask):

@@ -307,8 +307,9 @@ def _footage(r: Measured, experiment: Experiment, film: Film, moved: ParticleSta
     at = outlines(film.masks[index[:, 0], index[:, 1]], film.cut[index[:, 1]])
     at, begun = (Outlines(*(t.to(device) for t in o)) for o in (at, outlines(film.masks[0, first], film.cut[first])))
     cameras = film.cameras._replace(viewmats=film.cameras.viewmats.to(device), Ks=film.cameras.Ks.to(device))
-    _, depth = project(moved.x[0].float().cpu(), film.cameras)
-    if bool((depth <= 0).any()):
+    _, depth = project(moved.x[0].float().cpu(), film.cameras.at(0))
+    later = range(1, len(film.times)) if film.cameras.moving else ()
+    if bool((depth <= 0).any()) or any(bool((project(r.body.x.float(), film.cameras.at(t))[1] <= 0).all()) for t in later):
         raise UserError(f"recording {r.name}: the body lies behind a camera: check transform_matrix, and that positions are in metres")
     scale = float((depth.mean(dim=1) / film.cameras.Ks[:, 0, 0]).mean()) / film.factor
     look = looks(experiment[r.name], experiment, r.body, film, device)

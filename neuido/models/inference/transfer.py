@@ -144,7 +144,7 @@ def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]],
     """Simulate a condition, write its particles, video and contact sheet, and return their folder."""
     motion, gaussians, first = simulate_condition(condition, known)
     with torch.no_grad():
-        images = render(gaussians, first.views([first.scoring_views[0]]), background=first.background)[0][:, 0]
+        images = render(gaussians, first.views([first.scoring_views[0]]).at(0), background=first.background)[0][:, 0]
     folder = folder_of(out, f"condition-{condition.name}")
     write_plys(folder / "particles", motion, motion.times)
     write_video(folder / "video.mp4", images)

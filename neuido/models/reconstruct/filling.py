@@ -72,13 +72,14 @@ def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *
 
     Args:
         masks: Coverage of each pixel by the object, (V, H, W).
-        cameras: Cameras of the V views.
+        cameras: Cameras of the V views; of cameras that move, those of the first frame count.
         lower, upper: Corners of a box that contains the body [m].
         resolution: Cells along the longest side of the body.
 
     Raises:
         UserError: Masks and cameras differ in shape, or no point is consistent with all masks.
     """
+    cameras = cameras.at(0)
     if tuple(masks.shape) != (len(cameras.viewmats), cameras.height, cameras.width):
         raise UserError(f"masks have shape {tuple(masks.shape)}; the cameras need {(len(cameras.viewmats), cameras.height, cameras.width)}")
     low, high = masks.new_tensor(lower), masks.new_tensor(upper)

@@ -245,6 +245,7 @@ class ReconstructModule(LightningModule):
 
 
 def _first_frame(batch: MultiViewBatch, device: torch.device) -> MultiViewBatch:
-    cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats.to(device), Ks=batch.cameras.Ks.to(device))
+    still = batch.cameras.at(0)
+    cameras = still._replace(viewmats=still.viewmats.to(device), Ks=still.Ks.to(device))
     images, masks = batch.images[:, :1].to(device), batch.masks[:, :1].to(device)
     return batch._replace(images=images, masks=masks, cameras=cameras, background=batch.background.to(device))

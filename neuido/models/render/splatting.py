@@ -39,7 +39,7 @@ def rasterize(
     covariances: Tensor,  # (..., N, 3, 3)
     opacities: Tensor,  # (N,) or (..., N)
     colours: Tensor,  # (N, 3) or (..., N, 3); with sh_degree (N, K, 3)
-    viewmats: Tensor,  # (V, 4, 4)
+    viewmats: Tensor,  # (V, 4, 4), or (V, T, 4, 4) for cameras that move
     Ks: Tensor,  # (V, 3, 3)
     width: int,
     height: int,
@@ -63,7 +63,8 @@ def rasterize(
         covariances: Covariances [m^2]; only the symmetric part is used.
         opacities: Opacities in 0..1.
         colours: RGB, or spherical harmonics if `sh_degree` is given; then RGB = max(0, 1/2 + harmonics in the viewing direction).
-        viewmats: World-to-camera matrices, OpenCV convention.
+        viewmats: World-to-camera matrices, OpenCV convention. With a pose for each frame, the leading dimension of the means is the frame,
+            and the first poses are used where there are more of them than frames.
         Ks: Intrinsics [pixels]; skew is ignored.
         width: Image width [pixels].
         height: Image height [pixels].
@@ -83,6 +84,11 @@ def rasterize(
     Raises:
         UserError: Shapes do not match, a number is not finite, or the back end is not available.
     """
+    if viewmats.dim() == 4:
+        parts = _frame_by_frame(means, covariances, opacities, colours, viewmats, rotations, background, sh_degree)
+        options = {"sh_degree": sh_degree, "near": near, "far": far, "eps2d": eps2d, "backend": backend, "capacity": capacity}
+        drawn = [rasterize(*part[:4], part[4], Ks, width, height, rotations=part[5], background=part[6], **options) for part in parts]
+        return torch.stack([image for image, _ in drawn]), torch.stack([alpha for _, alpha in drawn])
     frames, means, covariances, opacities = _frames(means, covariances, opacities, viewmats, Ks)
     if backend not in BACKENDS:
         raise UserError(f"backend is {backend!r}; one of {', '.join(BACKENDS)}")
@@ -129,6 +135,34 @@ class Splatting(nn.Module):
     def forward(self, gaussians: Gaussians, cameras: Cameras) -> tuple[Tensor, Tensor]:
         """Return images (..., V, H, W, 3) and alphas (..., V, H, W)."""
         return render(gaussians, cameras, background=self.background, **self.options)
+
+
+def _frame_by_frame(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    colours: Tensor,
+    viewmats: Tensor,
+    rotations: Tensor | None,
+    background: Tensor | None,
+    sh_degree: int | None,
+):
+    """Yield the arguments of `rasterize` for each frame: means, covariances, opacities, colours, viewmats, rotations and background."""
+    if means.dim() != 3 or len(means) > viewmats.shape[1]:
+        raise UserError(
+            f"means have shape {tuple(means.shape)}; needed (K, N, 3) with at most {viewmats.shape[1]} frames, for which the cameras "
+            "have a pose; `Cameras.at(frame)` holds a camera still"
+        )
+    given = (
+        (covariances, covariances.dim() == 4),
+        (opacities, opacities.dim() == 2),
+        (colours, sh_degree is None and colours.dim() == 3),
+        (rotations, rotations is not None and rotations.dim() == 4),
+        (background, background is not None and background.dim() == 5),
+    )
+    for k in range(len(means)):
+        own = [t[k] if t is not None and each else t for t, each in given]
+        yield means[k], own[0], own[1], own[2], viewmats[:, k], own[3], own[4]
 
 
 def _frames(means: Tensor, covariances: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor):

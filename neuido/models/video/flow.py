@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neuido.data.cameras import refuse_moving
 from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import write_arrays
 from neuido.errors import UserError
@@ -186,8 +187,9 @@ def pixel_length(cameras: Cameras, centre: Tensor) -> Tensor:
         centre: The point, such as the centre of the body [m], (3,).
 
     Raises:
-        UserError: The point lies behind a camera.
+        UserError: The point lies behind a camera, or cameras move.
     """
+    refuse_moving(cameras, "the recording", "optical flow would hold their motion too; adapt a law to it instead (neuido fit)")
     view = cameras.viewmats.double()
     depth = (view[:, 2, :3] @ centre.to(view)) + view[:, 2, 3]
     if bool((depth <= 0).any()):

@@ -1,4 +1,5 @@
 import json
+import shutil
 import struct
 
 import cv2
@@ -195,7 +196,7 @@ def test_a_wrong_pose(tmp_path, case, matrix, message):
         (lambda c: c["frames"][3].update(time=0.0), "two images"),
         (lambda c: c["frames"][3].update(view=1.5), "view must be a whole number"),
         (lambda c: c["frames"][3].update(w=32), "images of two sizes"),
-        (lambda c: c["frames"][3]["transform_matrix"][0].__setitem__(3, 9.0), "view 0 moves"),
+        (lambda c: c["frames"][3].update(fl_x=9.0), "the lens of view 0 changes"),
         (lambda c: [frame.pop("time") for frame in c["frames"]], "add `time`"),
         (lambda c: c["frames"][3].update(file_path="images/none.png"), "none.png is missing"),
     ],
@@ -286,11 +287,16 @@ def test_transforms_without_view_are_grouped_by_pose(tmp_path):
     assert len(read(file).times) == 1 and len(read(file).views) == 3
 
 
-def test_monocular_recordings_have_holes(tmp_path):
+def test_monocular_recordings_are_one_camera_that_moves(tmp_path):
     """D-NeRF's: one image for each time, from another pose each."""
     made(tmp_path, "nerfstudio")
+    shutil.copytree(tmp_path / "nerfstudio", tmp_path / "nerfstudio-whole")
     file = tmp_path / "nerfstudio" / "transforms.json"
     edit(file, lambda c: c.update(frames=[{k: v for k, v in c["frames"][i].items() if k != "view"} for i in (0, 5, 10)]))
+    whole, found = read(tmp_path / "nerfstudio-whole"), read(file)
+    assert [path and path.name for path in found.images[0]] == ["0_000.png", "1_001.png", "2_002.png"] and len(found.images) == 1
+    torch.testing.assert_close(found.cameras.viewmats[0], whole.cameras.viewmats)
+    edit(file, lambda c: [frame.update(view=i) for i, frame in enumerate(c["frames"])])
     found = read(file)
     assert [[path is not None for path in row] for row in found.images] == [[v == t for t in range(3)] for v in range(3)]
 

@@ -104,7 +104,8 @@ def folders(tmp_path_factory) -> dict[str, Path]:
     made.filmed(root / "drag", EFFECTS, **options)
     made.filmed(root / "null", {}, **options)
     made.filmed(root / "hull", EFFECTS, particles=False, views=6, frames=8, side=4, width=72)
-    return {name: root / name for name in ("drag", "null", "hull")}
+    made.filmed(root / "turning", EFFECTS, **options, turn=50.0)
+    return {name: root / name for name in ("drag", "null", "hull", "turning")}
 
 
 def problem_of(folder: Path, *names: str, settings: int = 2) -> VideoProblem:
@@ -161,6 +162,35 @@ def test_a_body_is_made_of_silhouettes_where_none_is_given(folders):
     loose, firm = (problem_of(folders[name]).parameter("velocity_x:throw").scale for name in ("hull", "drag"))
     assert loose > 3 * firm
     assert problem.error(problem.predict([EFFECTS], 0)[0] - problem.recordings[0].y, 0) < 4.0
+
+
+def test_cameras_that_turn_about_the_body_show_what_fixed_ones_show(folders):
+    turning, fixed = problem_of(folders["turning"]), problem_of(folders["drag"])
+    assert turning.footage[0].cameras.moving and not fixed.footage[0].cameras.moving
+    truth, declared = turning.predict([{"young": 6e4, **EFFECTS}, {}], 0)
+    y, noise = turning.recordings[0].y, turning.recordings[0].noise
+    assert noise == pytest.approx(fixed.recordings[0].noise, rel=0.3)  # of the first frame, in which the cameras stand in the same places
+    assert turning.error(truth - y, 0) < 1.5 * noise
+    assert turning.error(declared - y, 0) > 3 * noise
+    still = replace(turning, footage=tuple(f._replace(cameras=f.cameras.at(0)) for f in turning.footage))
+    assert still.error(still.predict([{"young": 6e4, **EFFECTS}], 0)[0] - y, 0) > 5 * noise
+
+
+@pytest.mark.slow
+def test_drag_is_found_by_cameras_that_turn_about_the_body(folders):
+    found = [diagnose(problem_of(folders[name], "drag_linear", "viscosity_shear"), draws=39, most=1) for name in ("turning", "drag")]
+    assert [d.answer for d in found] == ["effect", "effect"]
+    assert [[t.candidate.name for t in d.effects] for d in found] == [["drag_linear"], ["drag_linear"]]
+    turned, fixed = (d.after["drag_linear.k"] for d in found)
+    assert turned == pytest.approx(4.0, rel=0.2) and turned == pytest.approx(fixed, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_body_is_made_of_silhouettes_of_cameras_that_turn(folders, tmp_path):
+    made.filmed(tmp_path / "hull", EFFECTS, particles=False, views=6, frames=8, side=4, width=72, turn=50.0)
+    turned, fixed = (problem_of(folder).measured[0].body for folder in (tmp_path / "hull", folders["hull"]))
+    assert torch.equal(turned.x, fixed.x)
+    np.testing.assert_allclose(turned.v.mean(dim=0), fixed.v.mean(dim=0), atol=0.05)
 
 
 def test_gaussians_of_the_folder_are_what_is_drawn(folders, tmp_path):

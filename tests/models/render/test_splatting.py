@@ -208,6 +208,18 @@ def test_batch_equals_single_calls(device):
                 assert torch.equal(one[1][0], fast[1][i, j, v])
 
 
+def test_cameras_that_move_show_each_frame_from_its_pose():
+    means, covariances, opacities, colours = cloud(30, frames=(3,))
+    still = [cameras(24, 16, distance=4.0 + 0.5 * t) for t in range(4)]
+    moving = still[0]._replace(viewmats=torch.stack([each.viewmats for each in still], 1))
+    images, alphas = rasterize(means, covariances, opacities, colours, *moving, background=torch.ones(3))
+    for t in range(3):  # the fourth pose is that of a frame that is not drawn
+        wanted = rasterize(means[t], covariances[t], opacities, colours, *still[t], background=torch.ones(3))
+        assert torch.equal(images[t], wanted[0]) and torch.equal(alphas[t], wanted[1])
+    with pytest.raises(UserError, match=r"at most 4 frames, for which the cameras have a pose"):
+        rasterize(means[0], covariances[0], opacities, colours, *moving)
+
+
 @pytest.mark.parametrize("device", DEVICES)
 def test_opacities_and_colours_of_each_frame(device):
     scene = cloud(30, frames=(3,), seed=14, device=device)
