@@ -169,8 +169,7 @@ def _solved(rig: Rig, time: Tensor | None, step: float, periodic: bool) -> tuple
         timed = any(getattr(specimen.effects, name) is not None for name in RATES)
         if not timed and not probe.remembers and probe.plasticity is None:
             return rig.rows_alone(TensorEngine(rig))
-        plain = PlaneEngine.serves(specimen)
-        engine = PlaneEngine(specimen, 1 + rig.unknowns, shear=rig.shear) if plain else TensorEngine(rig)
+        engine = PlaneEngine(rig) if PlaneEngine.serves(specimen) else TensorEngine(rig)
         return rig.along(engine, None if time is None else time.double().numpy(), step, periodic=periodic)
 
 

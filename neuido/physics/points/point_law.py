@@ -123,7 +123,7 @@ class PointLaw(Constitutive):
     def _flow(self, row: Tensor, trial: Tensor, history: Any, dt: Tensor, scale: Tensor) -> tuple[Tensor, History]:
         if not self.flows:
             return super()._flow(row, trial, history, dt, scale)
-        flow = Flow(torch, row[:, :6].unbind(1), self.value, history.backs.shape[1])
+        flow = Flow(row[:, :6].unbind(1), self.value, history.backs.shape[1])
         trial_stress = (row[:, 0] * scale)[:, None, None] * deviator(hencky(trial)) - history.backstress
         step = PlasticStep(flow, trial_stress.flatten(1), history.backs.flatten(2), history.alpha, dt, scale)
         size = step.solved()

@@ -1,10 +1,9 @@
 """A specimen in a testing machine: what is prescribed, what is free, and the path that follows, row by row.
 
 The machine prescribes stretches or shear, or the stress along the loading axis (creep). The other stretches follow from zero lateral
-stress by Newton's method. Two engines compute the stress: `plane_engine` where the law is isotropic, and `PointLaw` for everything else.
+stress by Newton's method. Two engines compute the stress: `plane_engine`, a kernel, where the law is isotropic, and `PointLaw` otherwise.
 """
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -30,15 +29,20 @@ State = list[np.ndarray]
 
 
 class Engine(Protocol):
-    """The stress of P parameter sets along a path."""
+    """The strains and the stress of P parameter sets along a path, with their state, which begins at rest."""
 
-    def start(self) -> State:
-        """Return the state at rest; every array has P rows."""
+    def follow(self, gaps: np.ndarray, timed: bool, now: float, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Go through all rows of the path, and keep the state at its end.
 
-    def advance(self, begun: State, total: np.ndarray, dt: float, now: float) -> tuple[np.ndarray, State]:
-        """Return the Kirchhoff stress t1, t2, t3, t12 in the axes of the specimen, (P, c, 4) [Pa], and the states, (P, c, ...).
+        Args:
+            gaps: Time before each row [s], (n,).
+            timed: Whether the rate counts.
+            now: Time at the start [s].
+            step: Largest increment of a logarithmic stretch in one step [-].
 
-        `total` (P, c, 4) holds the logarithmic stretches along the axes, and the amount of shear; it is reached in a time `dt` [s].
+        Returns:
+            Strains (logarithms of the three stretches, amount of shear) and Kirchhoff stress t1, t2, t3, t12 [Pa] in the axes of the
+            specimen, (P, n, 4) each. The stress is NaN where it does not converge.
         """
 
 
@@ -167,57 +171,64 @@ class Rig:
 
     def along(self, engine: Engine, time: np.ndarray | None, step: float, *, periodic: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Return strains and Kirchhoff stress of every row, (P, n, 4) each, one row after the other, with the history."""
-        P, n = self.specimen.points, len(self.path)
+        n = len(self.path)
         times = np.arange(n + 1.0) if time is None else np.concatenate([[time[0] - approach(time)], time]) - time[0]
-        gaps = np.diff(times)
-        state: list = [engine.start(), np.zeros((P, self.unknowns)), np.zeros((P, self.unknowns)), np.zeros(self.path.shape[1])]
-        es, ts, before = [], [], None
+        gaps, before = np.diff(times), None
         for cycle in range(CYCLES if periodic else 1):
             if cycle:
                 gaps = np.concatenate([gaps[-1:], gaps[1:]])  # the first row follows the last one
-            es, ts = [], []
-            now = float(times[0]) if not cycle else 0.0
-            for given, dt in zip(self.path, gaps, strict=True):
-                e, t = self._to(engine, state, given, None if time is None else float(dt), now, step)
-                now += float(dt)
-                es.append(e)
-                ts.append(t)
-            stress = np.stack(ts, 1)
-            if before is not None and np.nanmax(np.abs(stress - before), initial=0.0) < SETTLED * np.nanmax(np.abs(stress), initial=0.0):
+            es, ts = engine.follow(gaps, time is not None, float(times[0]) if not cycle else 0.0, step)
+            if before is not None and np.nanmax(np.abs(ts - before), initial=0.0) < SETTLED * np.nanmax(np.abs(ts), initial=0.0):
                 break
-            before = stress
-        return np.stack(es, 1), np.stack(ts, 1)
+            before = ts
+        return es, ts
 
-    def _to(self, engine: Engine, state: list, given: np.ndarray, dt: float | None, now: float, step: float):
-        """Go on to a row; `state` (engine's state, unknowns, their change per change of the path, last row) is replaced."""
-        begun, u, ratio, last = state
-        P = self.specimen.points
-        jump = given - last
-        size = np.abs(jump).max() / (self.scale.min() if self.lead else 1.0)
-        pieces = max(math.ceil(size / step - 1e-9), 1)
-        part = 1.0 if dt is None else dt / pieces
-        for piece in range(pieces):
-            at = np.broadcast_to(last + jump * ((piece + 1) / pieces), (P, len(given)))
-            when = 0.0 if dt is None else now + part * piece
-            first = u
-            u, e, t, after = self.solve(
-                u + ratio * (jump[0] / pieces), at, lambda e, begun=begun, when=when: engine.advance(begun, e, part, when), self.scale
-            )
-            if abs(jump[0]) > 0 and not self.lead:
-                slope = (u - first) / (jump[0] / pieces)
-                ratio = np.where(np.isfinite(slope), np.clip(slope, -2, 2), ratio)
-            begun = [own[:: 1 + self.unknowns] for own in after]
-        state[:] = begun, u, ratio, given
-        return e, t
+    def pieces(self, path: np.ndarray, step: float) -> np.ndarray:
+        """Return the number of steps between neighbouring rows of a path (n, w), (n - 1,)."""
+        size = np.abs(np.diff(path, axis=0)).max(1) / (self.scale.min() if self.lead else 1.0)
+        return np.maximum(np.ceil(size / step - 1e-9), 1).astype(np.int32)
 
 
 class TensorEngine:
     """The stress by `PointLaw`, for any law, effect and mode; one law for `copies` states per parameter set."""
 
     def __init__(self, rig: Rig) -> None:
-        self.specimen, self.shear, self.copies = rig.specimen, rig.shear, 1 + rig.unknowns
+        self.rig, self.specimen, self.shear, self.copies = rig, rig.specimen, rig.shear, 1 + rig.unknowns
         self.R = turn(torch.from_numpy(rig.direction))
         self.material = self.law(self.copies)
+        P = self.specimen.points
+        # the state, the unknowns, their change per change of the path, and the last row
+        self.state: list = [self.start(), np.zeros((P, rig.unknowns)), np.zeros((P, rig.unknowns)), np.zeros(rig.path.shape[1])]
+
+    def follow(self, gaps: np.ndarray, timed: bool, now: float, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Go through all rows of the path; see `Engine`."""
+        path = self.rig.path
+        es, ts = [], []
+        for given, dt, pieces in zip(path, gaps, self.rig.pieces(np.concatenate([self.state[3][None], path]), step), strict=True):
+            e, t = self._to(given, float(dt) if timed else None, now, int(pieces))
+            now += float(dt)
+            es.append(e)
+            ts.append(t)
+        return np.stack(es, 1), np.stack(ts, 1)
+
+    def _to(self, given: np.ndarray, dt: float | None, now: float, pieces: int) -> tuple[np.ndarray, np.ndarray]:
+        """Go on to a row in some number of steps."""
+        rig, (begun, u, ratio, last) = self.rig, self.state
+        jump = (given - last) / pieces
+        part = 1.0 if dt is None else dt / pieces
+        for piece in range(pieces):
+            at = np.broadcast_to(last + jump * (piece + 1), (self.specimen.points, len(given)))
+            when = 0.0 if dt is None else now + part * piece
+            first = u
+            u, e, t, after = rig.solve(
+                u + ratio * jump[0], at, lambda e, begun=begun, when=when: self.advance(begun, e, part, when), rig.scale
+            )
+            if abs(jump[0]) > 0 and not rig.lead:
+                slope = (u - first) / jump[0]
+                ratio = np.where(np.isfinite(slope), np.clip(slope, -2, 2), ratio)
+            begun = [own[:: 1 + rig.unknowns] for own in after]
+        self.state[:] = begun, u, ratio, given
+        return e, t
 
     def law(self, each: int) -> PointLaw:
         """Return the law for `each` particles per parameter set; those of one set are consecutive."""
@@ -241,12 +252,17 @@ class TensorEngine:
         return self.seen(law.stress(F, torch.zeros_like(F), law.start()), e.shape[:-1])
 
     def start(self) -> State:
+        """Return the state at rest; every array has P rows."""
         P = self.specimen.points
         eye = np.broadcast_to(np.eye(3), (P, 3, 3))
         own = [part.reshape(P, self.copies, *part.shape[1:])[:, 0].numpy() for part in self.material.start()]
         return [eye, eye, *own]  # F in all, the elastic F, and the history
 
     def advance(self, begun: State, total: np.ndarray, dt: float, now: float) -> tuple[np.ndarray, State]:
+        """Return the Kirchhoff stress after a step, (P, c, 4) [Pa], and the states, (P * c, ...).
+
+        `total` (P, c, 4) holds the strains that are reached in a time `dt` [s].
+        """
         whole, F, *own = (torch.from_numpy(np.repeat(part, self.copies, 0)) for part in begun)
         new = self.gradient(total).reshape(-1, 3, 3)
         increment = new @ torch.linalg.inv(whole)
