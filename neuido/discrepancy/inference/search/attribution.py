@@ -1,7 +1,7 @@
 """The whole diagnosis: add one effect at a time, drop effects that became needless, and state how sure the answer is."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -198,6 +198,60 @@ def diagnose(
     budget = budget_of(problem, memo, passes, seconds)
     if (watch := getattr(tell, "watch", None)) is not None:
         watch(budget)
+
+    def new_search(setting: int) -> Search:
+        shared = {"tell": tell, "memo": memo, "budget": budget, "journal": journal}
+        return next_effect.new_search(problem, setting=setting, keep=keep, draws=draws, seed=seed, **shared)
+
+    tried, starts = fit_declared_model(problem, new_search, journal)
+    course = first_effect(tried, starts)
+    add_effects(course, most)
+    try_pairs(course, tried, starts)
+    if len(course.found) == 1:
+        widen(course.search, course.rounds[0], course.at, course.others.values())
+    budget.conclude()
+    if len(course.found) > 1:
+        weigh_together(course)
+    made = conclude(course.search, course.start, course.at, course.found, course.rounds)
+    if statistics and made.case is not None:
+        made.statistics = statistics_of([s.lab for s in tried], [s.floor for s in starts], journal, (made.case.before, made.case.after))
+    return made
+
+
+@dataclass(eq=False)
+class Course:
+    """How far a diagnosis has come."""
+
+    search: Search
+    """The search by the method that was chosen."""
+    start: Stand
+    """The declared model by this method."""
+    at: Stand
+    """The model with all effects that were found."""
+    rounds: list[Round]
+    """A round for each effect, and perhaps one that found none."""
+    found: list[Trial]
+    """The effects, in the order in which they were found."""
+    others: dict[Search, Round]
+    """First rounds of the methods that were not chosen."""
+    hurried: bool = False
+    """Whether the budget ended while effects were added."""
+    grown: tuple[Search, list[Round]] | None = None
+    """Two effects that were fitted at once, and the search they belong to."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing more can be asked of the data."""
+        return comparing.is_settled(self.search.lab, self.at.errors)
+
+
+def fit_declared_model(
+    problem: Problem, new_search: Callable[[int], Search], journal: Journal
+) -> tuple[list[Search], list[Stand]]:  # fmt: skip
+    """Fit the declared model by each method of simulation that may be needed, and return the searches and the fits.
+
+    A further method is tried only where the ones before leave more than noise, and time.
+    """
     tried: list[Search] = []
     starts: list[Stand] = []
     for n in problem.solvers:
@@ -205,9 +259,8 @@ def diagnose(
             if starts:
                 continue
             raise UserError(problem.refusal(n))
-        shared = {"tell": tell, "memo": memo, "budget": budget, "journal": journal}
-        search = next_effect.new_search(problem, setting=n, keep=keep, draws=draws, seed=seed, **shared)
-        if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or budget.skips(problem.setting_name(n))):
+        search = new_search(n)
+        if starts and (comparing.is_settled(tried[-1].lab, starts[-1].errors) or search.lab.budget.skips(problem.setting_name(n))):
             continue
         if len(starts) == 1 and is_explained_exactly(tried[0], starts[0]):
             break
@@ -221,58 +274,75 @@ def diagnose(
             tried.append(search)
             starts.append(start)
             journal.bases.append(journal.fit(n, {}, None, start, search.lab.parts))
+    return tried, starts
+
+
+def first_effect(tried: list[Search], starts: list[Stand]) -> Course:
+    """Look for the first effect by each method, and go on with the method that explains the data best."""
     chosen, firsts = first_rounds(tried, starts)
     search, rounds = tried[chosen], firsts[chosen]
-    start = rounds[0].plain or starts[chosen]
     if len(tried) > 1:
-        search.lab.tell(f"solver: {problem.setting_name(search.lab.setting)}")
-    at = start
-    found: list[Trial] = [r.chosen for r in rounds[:-1] if r.chosen is not None]
+        search.lab.tell(f"solver: {search.lab.problem.setting_name(search.lab.setting)}")
+    start = rounds[0].plain or starts[chosen]
+    found = [r.chosen for r in rounds[:-1] if r.chosen is not None]
     others = {tried[i]: own[0] for i, own in firsts.items() if i != chosen and len(own) == 1}
-    hurried, grown = False, None
+    return Course(search, start, start, rounds, found, others)
+
+
+def add_effects(course: Course, most: int) -> None:
+    """Add one effect after the other until only noise is left, the budget ends, or none of them helps.
+
+    Where simulations run together, pairs are grown as soon as one effect leaves more than noise.
+    """
+    search, problem, rounds = course.search, course.search.lab.problem, course.rounds
+    budget = search.lab.budget
     while rounds[-1].chosen is not None:
         step = rounds[-1].chosen
-        found.append(step)
+        course.found.append(step)
         # an effect near the noise counts too: it is named if one simulation with it leaves only noise, however small its gain
-        settled = len(found) == most or comparing.is_noise(search.lab, step.errors)
-        hurried = budget.over
-        if hurried and not settled:
+        enough = len(course.found) == most or comparing.is_noise(search.lab, step.errors)
+        course.hurried = budget.over
+        if course.hurried and not enough:
             budget.skips("a further effect")
-        if hurried:  # only the last fit follows
+        if course.hurried:  # only the last fit follows
             budget.conclude()
-        at = base_fits.finished(search.lab, step.stand)
-        if settled or hurried or comparing.is_noise(search.lab, at.errors):
-            break
-        if problem.together and len(found) == 1 and (grown := by_growing(search, rounds[0], at, others)):
-            break
-        if problem.settings > 1 and not comparing.is_settled(search.lab, at.errors) and next_effect.over_floor(search.lab, at) < CLEAR:
-            break
-        rounds.append(next_effect.find(search, at.fit, at.floor, found))
+        course.at = base_fits.finished(search.lab, step.stand)
+        if enough or course.hurried or comparing.is_noise(search.lab, course.at.errors):
+            return
+        if problem.together and len(course.found) == 1 and (grown := by_growing(search, rounds[0], course.at, course.others)):
+            course.grown = grown
+            return
+        if problem.settings > 1 and not course.settled and next_effect.over_floor(search.lab, course.at) < CLEAR:
+            return
+        rounds.append(next_effect.find(search, course.at.fit, course.at.floor, course.found))
+
+
+def try_pairs(course: Course, tried: list[Search], starts: list[Stand]) -> None:
+    """Look for two effects that explain the data only together, and take them where they do better than what was found."""
+    search, budget, found = course.search, course.search.lab.budget, course.found
     # where simulations run one by one, growing pairs come after the cheaper steps; where nothing was named, they come last
-    if not hurried and (not found or (len(found) == 1 and not problem.together)):
-        grown = by_growing(search, rounds[0], at, others)
-    if hurried and 0 < len(found) < MOST and not comparing.is_settled(search.lab, at.errors):
+    if not course.hurried and (not found or (len(found) == 1 and not search.lab.problem.together)):
+        course.grown = by_growing(search, course.rounds[0], course.at, course.others)
+    if course.hurried and 0 < len(found) < MOST and not course.settled:
         budget.skips("two effects at once")
-    if grown or (0 < len(found) < 3 and not hurried):
-        by, pair = grown or two_effects(search, rounds, found, at, others)
-        if by is not search:
-            search, start = by, pair[0].plain or starts[tried.index(by)]
-        if pair:
-            rounds = pair
-            found = [r.chosen for r in pair if r.chosen is not None]
-            at = base_fits.finished(search.lab, found[-1].stand)
-    if len(found) == 1:
-        widen(search, rounds[0], at, others.values())
-    budget.conclude()
-    if len(found) > 1:
-        floor = discretisation.floor_at(search.lab, at.fit.point)
-        fit, found = drop(search, at.fit, floor, found)
-        fit, found = narrow(search, fit, floor, found, rounds)
-        at = base_fits.finished(search.lab, Stand(fit, floor, search.lab.mean_squares([fit.point], floor)[0]))
-    made = conclude(search, start, at, found, rounds)
-    if statistics and made.case is not None:
-        made.statistics = statistics_of([s.lab for s in tried], [s.floor for s in starts], journal, (made.case.before, made.case.after))
-    return made
+    if not course.grown and (course.hurried or not 0 < len(found) < MOST):
+        return
+    by, pair = course.grown or two_effects(search, course.rounds, found, course.at, course.others)
+    if by is not search:
+        course.search, course.start = by, pair[0].plain or starts[tried.index(by)]
+    if pair:
+        course.rounds = pair
+        course.found = [r.chosen for r in pair if r.chosen is not None]
+        course.at = base_fits.finished(by.lab, course.found[-1].stand)
+
+
+def weigh_together(course: Course) -> None:
+    """Drop effects that the others make needless, and choose again within the class of each beside all others."""
+    lab = course.search.lab
+    floor = discretisation.floor_at(lab, course.at.fit.point)
+    fit, found = drop(course.search, course.at.fit, floor, course.found)
+    fit, course.found = narrow(course.search, fit, floor, found, course.rounds)
+    course.at = base_fits.finished(lab, Stand(fit, floor, lab.mean_squares([fit.point], floor)[0]))
 
 
 def budget_of(problem: Problem, memo: Memo, passes: float, seconds: float) -> Budget:
