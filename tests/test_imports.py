@@ -11,21 +11,24 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "neuido"
 MODULES = sorted(path.relative_to(PACKAGE.parent).with_suffix("").as_posix().replace("/", ".") for path in PACKAGE.rglob("*.py"))
 
-ROOT = ("neuido", "neuido.__version__", "neuido.configs_root")
-GROUND = ("neuido.types", "neuido.errors")
+ROOT = ("neuido",)
+"""Frames are exported and shown by the public names, which the face of the package imports at their use."""
+GROUND = ("neuido.types", "neuido.errors", "neuido.installation")
 LIGHTNING = ("neuido.models.stages", "neuido.commands", "neuido.data.trajectories", "neuido.data.scenes", "neuido.data.clips",
              "neuido.models.reconstruct")  # fmt: skip
 """The rooms whose modules may import Lightning: the training modules, the data modules and the commands."""
 ROOMS = {  # room: the parts of neuido that it may import, itself included
     "neuido.types": (),
     "neuido.errors": (),
+    "neuido.installation": (),
     "neuido.physics": (*GROUND, "neuido.physics"),
     "neuido.data": (*GROUND, "neuido.physics", "neuido.data"),
     "neuido.models": (*GROUND, "neuido.physics", "neuido.data", "neuido.models"),
     "neuido.discrepancy": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.discrepancy"),
     "neuido.viewer": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.viewer"),
+    "neuido.export": (*GROUND, "neuido.physics", "neuido.data", "neuido.models", "neuido.export"),
 }
-PHYSICS_MAY = {"torch", "numpy", "warp", "neuido"} | set(sys.stdlib_module_names)
+PHYSICS_MAY = {"torch", "numpy", "warp", "neuido", "lazy_loader"} | set(sys.stdlib_module_names)
 
 
 def within(name: str, parts: tuple[str, ...]) -> bool:
@@ -33,7 +36,7 @@ def within(name: str, parts: tuple[str, ...]) -> bool:
 
 
 def imports(source: str, module: str = "neuido.test") -> set[str]:
-    """Every module that a source imports, at its top or inside a function; `from a import b` counts as a.b."""
+    """Every module that a source imports, at its top, inside a function or by its written name; `from a import b` counts as a.b."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -43,6 +46,8 @@ def imports(source: str, module: str = "neuido.test") -> set[str]:
             if node.level:
                 base = ".".join([*module.split(".")[: -node.level], *filter(None, [node.module])])
             found |= {f"{base}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module") and isinstance(node.args[0], ast.Constant):
+            found.add(node.args[0].value)
     return found
 
 
@@ -53,8 +58,8 @@ def imports_of(module: str) -> set[str]:
 
 
 def test_reader_sees_every_form_of_import():
-    source = "import a.b\nfrom c import d\ndef f():\n    from ..e import g\n"
-    assert imports(source, "neuido.x.y") == {"a.b", "c.d", "neuido.e.g"}
+    source = "import a.b\nfrom c import d\ndef f():\n    from ..e import g\n    return importlib.import_module('h.i')\n"
+    assert imports(source, "neuido.x.y") == {"a.b", "c.d", "neuido.e.g", "h.i"}
 
 
 @pytest.mark.parametrize("module", MODULES)
@@ -107,9 +112,9 @@ def test_light_modules_load_neither_torch_nor_lightning(module):
     assert answer.stdout.strip() == "[]"
 
 
-# The drawn structure. The front doors (`__init__.py`), which import public names lazily, are drawn with what they lead to left out.
+# The drawn structure. An `__init__.py` is a face: it defines nothing and imports nothing of the package; its stub names what it hands on.
 
-FLOORS, FOLDER_FLOORS, FILES, LINES = 9, 12, 14, 450
+FLOORS, FOLDER_FLOORS, FILES, LINES, FACE_LINES = 9, 12, 14, 450, 40
 COMMANDS = {path.stem for path in (PACKAGE / "commands").glob("*.py")}
 
 
@@ -149,6 +154,19 @@ def by_folder(graph: dict[str, set[str]], whole: tuple[str, ...] = ("neuido.comm
     for module, others in graph.items():
         out.setdefault(folder(module), set()).update(folder(other) for other in others if folder(other) != folder(module))
     return out
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module.endswith("__init__")])
+def test_faces_are_thin(module):
+    path = PACKAGE.parent / (module.replace(".", "/") + ".py")
+    rest = ast.parse(path.read_text()).body[1:]  # after the docstring
+    assert len(path.read_text().splitlines()) < FACE_LINES
+    lazy = ["import lazy_loader", "__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)"]
+    assert [ast.unparse(node).replace("(__getattr__, __dir__, __all__)", "__getattr__, __dir__, __all__") for node in rest] in ([], lazy)
+    stub = path.with_suffix(".pyi")
+    assert stub.is_file() == bool(rest)
+    if rest:  # a room hands on what lies in it, which keeps the direction; the package itself hands on the names of all rooms
+        assert {node.level for node in ast.walk(ast.parse(stub.read_text())) if isinstance(node, ast.ImportFrom)} == {1}
 
 
 def test_circles_are_seen():

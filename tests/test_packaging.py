@@ -81,6 +81,7 @@ def test_contents(built):
     for names in (wheel, sdist):
         assert not [name for name in names if name.startswith(("research", "docs", "shared")) or "__pycache__" in name]
         assert "neuido/py.typed" in names
+        assert {path.relative_to(ROOT).as_posix() for path in (ROOT / "neuido").rglob("*.pyi")} <= set(names)
         assert max(names.values()) < 10e6
         assert any(name.endswith("stage1.safetensors") for name in names)
     assert all(name.startswith(("neuido/", "neuido-")) for name in wheel)

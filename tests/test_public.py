@@ -21,7 +21,7 @@ PUBLIC = {
         AttachedMass Attachment Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Keyframes Operator OwnEffect
         ParticleState Plane Scene Simulator Skin UserError Walls __version__ colliders configs_root diagnose effects export
         import_file import_scene laws load_scene rasterize read_experiment read_law read_material_tests read_recording
-        read_tracks render shapes view
+        read_tracks render shapes show view
     """,
     "neuido.data": """
         Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
@@ -75,16 +75,22 @@ def test_every_name_is_there_and_documented(room, name):
 
 
 def test_type_checkers_see_every_name():
-    """What is imported lazily is imported for type checkers too; an editor then completes and documents it."""
-    for room in PUBLIC:
-        path = Path(import_module(room).__file__)
-        found = set()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-                found |= {alias.asname or alias.name for part in node.body if isinstance(part, ast.ImportFrom) for alias in part.names}
-        own = {"__version__", "configs_root"} if room == "neuido" else set()
-        assert set(PUBLIC[room].split()) - own <= found, room
+    """What is imported lazily stands in a stub, from which the names are imported too; an editor then completes and documents them."""
+    for face in Path(neuido.__file__).parent.rglob("__init__.pyi"):
+        room = ".".join(face.parent.relative_to(ROOT).parts)
+        tree = ast.parse(face.read_text())
+        imported = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+        (listed,) = (ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))
+        assert not [alias.name for alias in imported if alias.asname], f"{room}: another name is not seen at run time"
+        assert sorted(alias.name for alias in imported) == sorted(listed) == import_module(room).__all__, room
+    assert {(Path(import_module(room).__file__).parent / "__init__.pyi").is_file() for room in PUBLIC} == {True}
     assert (Path(neuido.__file__).parent / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("code", ["import neuido; neuido.Simulater", "import neuido.physics; neuido.physics.Simulater"])
+def test_a_wrong_name_is_told_with_the_right_one(code):
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert re.search(r"AttributeError: No neuido\S* attribute Simulater\. Did you mean: 'Simulator'\?$", answer.stderr.strip())
 
 
 def test_import_and_listing_load_no_torch():
@@ -96,8 +102,9 @@ def test_import_and_listing_load_no_torch():
 
 def test_export_is_a_function_whatever_was_imported_first():
     code = "import neuido.export.exporting, neuido; from neuido import export; print(callable(neuido.export), callable(export))"
+    code += "; import neuido.export.series; print(neuido.export is export)"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert answer.stdout.split() == ["True", "True"]
+    assert answer.stdout.split() == ["True", "True", "True"]
 
 
 def sources() -> list[tuple[str, str]]:

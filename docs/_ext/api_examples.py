@@ -335,6 +335,14 @@ frames = simulator.rollout(50, laws.FixedCorotated(5e4, 0.3), every=10)
 print(frames, frames.times)
 frames.save("motion.npz")  # or .csv, or .ply: a point cloud a frame
 """,
+    "show": f"""
+import neuido
+from neuido import Scene, Simulator, laws, shapes
+{_BALL}
+frames = simulator.rollout(50, laws.FixedCorotated(5e4, 0.3), every=10)
+player = neuido.show(frames, colour="speed")  # the last line of a notebook's cell plays it
+player.save("drop.html")
+""",
     "view": f"""
 import neuido
 from neuido import Scene, Simulator, laws, shapes

@@ -198,13 +198,11 @@ def api_pages() -> dict[str, str]:
             body = f"{(value.__doc__ or '').splitlines()[0]}\n\n" + "\n".join(
                 directive(getattr(value, n), f"{value.__name__}.{n}") for n in own
             )
-        elif inspect.ismodule(value) and not callable(value):
+        elif inspect.ismodule(value):
             own = [n for n, v in vars(value).items() if inspect.isfunction(v) and v.__module__ == value.__name__ and not n.startswith("_")]
             body = f"{(value.__doc__ or '').splitlines()[0]}\n\n" + "\n".join(
                 directive(getattr(value, n), f"{value.__name__}.{n}") for n in own
             )
-        elif inspect.ismodule(value):
-            body = directive(value.__call__, f"{value.__name__}.exporting.export")
         else:
             body = directive(value, f"neuido.{name}")
         example = f"## Example\n\n```python\n{EXAMPLES[name].strip()}\n```\n\n## Reference\n\n" if name in EXAMPLES else ""

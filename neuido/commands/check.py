@@ -39,11 +39,11 @@ def check_capture(folder: Path) -> None:
         UserError: The recording cannot be read, or something must be mended.
     """
     from neuido.data.scenes.capture_quality import capture_findings
-    from neuido.data.scenes.readers import MARKS, read
+    from neuido.data.scenes.readers import MARKS, read_recording
 
     if not any((folder / mark).exists() for marks in MARKS.values() for mark in marks):
         raise UserError(f"{folder} has none of {', '.join(KINDS)} and is no recording of images: `neuido import` makes such a folder")
-    found = read(folder)
+    found = read_recording(folder)
     print(f"{found.format} recording {found.name}, {len(found.views)} views, {len(found.times)} frames")
     findings = capture_findings(found)
     for finding in findings:

@@ -242,13 +242,13 @@ def _velocity(x: "Tensor", source: Path, options: dict[str, Any]) -> "Tensor":
 
     from neuido.data.bodies.shapes import rigid_velocity
     from neuido.data.scenes.filmed_scene import Motion, read_motion
-    from neuido.data.scenes.readers import read
+    from neuido.data.scenes.readers import read_recording
 
     motion = read_motion(source) if source.is_dir() else None
     if options["velocity"] is not None or options["angular_velocity"] is not None:
         still = (0.0, 0.0, 0.0)
         motion = Motion(options["velocity"] or still, options["angular_velocity"] or still)
-    known = None if motion is not None else read(source, recording=options["recording"]).body
+    known = None if motion is not None else read_recording(source, recording=options["recording"]).body
     if known is not None:
         from scipy.spatial import KDTree
 
@@ -305,9 +305,9 @@ def _compare(body: "Body", found: "Gaussians", truth: "Truth | None") -> dict[st
 
 
 def _write(target: Path, found: "Gaussians", body: "Body") -> None:
-    from neuido.models.render.gaussians import save_ply
+    from neuido.models.render.gaussians import save_gaussians
 
-    save_ply(target / "gaussians.ply", found)
+    save_gaussians(target / "gaussians.ply", found)
     arrays = {"x0": body.x.numpy(), "v0": body.v.numpy(), "volume": body.volume.numpy()}
     write_arrays(target / "body.npz", arrays, compressed=False)
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-import neuido
 from neuido.data.files.writing import make_real_folder, remove, write_bytes
 from neuido.discrepancy.problems.problem import Ask, Point, Problem, Recording, Rows
 from neuido.errors import shortened
+from neuido.installation import __version__
 
 IN_MEMORY = 500_000_000
 """Largest size of the predictions in memory [bytes]. The one that was used longest ago is dropped first."""
@@ -292,8 +292,8 @@ RELEVANT = ("errors.py", "types.py", "data", "discrepancy", "models", "physics")
 @functools.cache
 def code_digest() -> str:
     """Return a hash of the sources on which predictions depend, so that those of other code are not reused."""
-    root = Path(neuido.__file__).parent
-    digest = hashlib.sha256(neuido.__version__.encode())
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256(__version__.encode())
     for name in RELEVANT:
         place = root / name
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:

@@ -9,7 +9,7 @@ from neuido.data.files.writing import write_bytes, write_json
 from neuido.data.formats.ply import ply_bytes
 from neuido.data.progress import Progress
 from neuido.export.exchange import Exchange, Surface
-from neuido.models.render.gaussians import save_ply
+from neuido.models.render.gaussians import save_gaussians
 
 FORMAT = "neuido-sequence/1"
 
@@ -59,7 +59,7 @@ def write_ply(path: Path, made: Exchange, *, progress: bool = False) -> list[Pat
             if made.gaussians is not None:
                 name = f"{path.stem}_splats"
                 own = path.with_name(frame_name(name, k, made.frames, path.suffix))
-                save_ply(own, made.gaussians.at(k))
+                save_gaussians(own, made.gaussians.at(k))
                 names.setdefault(name, []).append(own)
             work.update()
     index = path.with_suffix(".json")

@@ -61,8 +61,22 @@ class Player:
         return target
 
 
-def player_of(frames: Any, *, law: Any = None, scene: Scene | None = None, colour: str | None = None, height: int = 480) -> Player:
-    """Return a player of frames; `Frames.show` describes the arguments."""
+def show(frames: Any, *, law: Any = None, scene: Scene | None = None, colour: str | None = None, height: int = 480) -> Player:
+    """Return a player of frames for a notebook, which shows it where it is the last line of a cell; it needs no server.
+
+    Args:
+        frames: `Frames`, or what else has `x`, and `v`, `C` and `F` where they are coloured by.
+        law: Elastic law, or an elastic and a plastic one, for the colours of stress.
+        scene: The scene of the frames, for floor and gravity.
+        colour: Quantity by which particles are coloured, such as "speed" or "strain"; the first that there is where absent.
+        height: Height of the player [px].
+
+    Returns:
+        The player; its `save` writes it as one HTML file.
+
+    Raises:
+        UserError: The extra `viewer` is missing, or the frames have no such quantity.
+    """
     elastic = law[0] if isinstance(law, tuple | list) else law
     return player(content_of_frames(frames, scene=scene, law=elastic), colour=colour, height=height)
 

@@ -134,9 +134,9 @@ def _ply_series(paths: Sequence[Path]) -> Content:
     title = paths[0].parents[1].name if title in ("particles", "ply") else title
     times, timed = _times(read_frame_times(paths[0].parent, len(paths)), len(paths), paths[0].parent)
     if _has_gaussians(paths[0]):
-        from neuido.models.render.gaussians import load_ply
+        from neuido.models.render.gaussians import load_gaussians
 
-        series: list[Gaussians] = [load_ply(path, device="cpu") for path in paths]
+        series: list[Gaussians] = [load_gaussians(path, device="cpu") for path in paths]
         return Content(title, gaussians=series, times=times, timed=timed)
     tables = [_points(path) for path in paths]
     if len({len(table) for table in tables}) > 1:
@@ -193,13 +193,13 @@ def _experiment(folder: Path, recording: str | None) -> Content:
 
 def _multiview(folder: Path, recording: str | None) -> Content:
     """Read a multi-view recording: its cameras with their images, and its body or Gaussians where the files have them."""
-    from neuido.data.scenes.readers import detect, read
+    from neuido.data.scenes.readers import detect, read_recording
 
     try:
         detect(folder)
     except UserError as error:
         raise UserError(f"{folder} holds nothing that can be viewed: give {KINDS}") from error
-    found = read(folder, recording=recording)
+    found = read_recording(folder, recording=recording)
     content = Content(found.name)
     if found.body is not None:
         content.motions = [Motion("body", content.times, found.body.x[None].cpu().numpy(), found.body.v[None].cpu().numpy())]
@@ -210,9 +210,9 @@ def _multiview(folder: Path, recording: str | None) -> Content:
 
 
 def _gaussians(path: Path) -> Gaussians:
-    from neuido.models.render.gaussians import load_ply
+    from neuido.models.render.gaussians import load_gaussians
 
-    return load_ply(path, device="cpu")
+    return load_gaussians(path, device="cpu")
 
 
 def _add_views(content: Content, found: Any) -> None:

@@ -14,7 +14,7 @@ def test_name_is_there_and_documented(name):
 
 
 def test_no_other_name():
-    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match=r"No neuido\.data attribute nothing"):
         _ = neuido.data.nothing
     assert set(neuido.data.__all__) <= set(dir(neuido.data))
 

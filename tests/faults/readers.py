@@ -38,7 +38,7 @@ from neuido.data.scenes.filmed_scene import (
     write_motion,
     write_setting,
 )
-from neuido.data.scenes.readers import read as read_views
+from neuido.data.scenes.readers import read_recording as read_views
 from neuido.data.trajectories.trajectory_files import FORMAT as TRAJECTORIES
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.discrepancy.problems.declared_model import read_model_file
@@ -48,7 +48,7 @@ from neuido.models.fewshot.method import read_tensors, write_tensors
 from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.inference.outputs import write_video
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.render.gaussians import attach_gaussians, load_ply, save_ply
+from neuido.models.render.gaussians import attach_gaussians, load_gaussians, save_gaussians
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from tests.data import samples
@@ -166,7 +166,7 @@ def _read_images(folder: Path) -> object:
 
 def _gaussians(folder: Path) -> None:
     x = torch.rand(12, 3, generator=torch.Generator().manual_seed(0))
-    save_ply(folder / "gaussians.ply", attach_gaussians(x, torch.full((12,), 1e-3)))
+    save_gaussians(folder / "gaussians.ply", attach_gaussians(x, torch.full((12,), 1e-3)))
     content = (folder / "gaussians.ply").read_bytes()
     (folder / "commented.ply").write_bytes(content.replace(b"end_header", "comment é\nend_header".encode()))
     vertices = read_ply_vertices(folder / "gaussians.ply")
@@ -175,7 +175,7 @@ def _gaussians(folder: Path) -> None:
 
 
 def _read_gaussians(folder: Path) -> object:
-    return [load_ply(path, device="cpu") for path in sorted(folder.glob("*.ply"))]
+    return [load_gaussians(path, device="cpu") for path in sorted(folder.glob("*.ply"))]
 
 
 def _assets(folder: Path) -> None:

@@ -13,8 +13,8 @@ import torch
 from neuido.data.files.writing import copy_file, write_arrays, write_figure, write_png, write_text
 from neuido.discrepancy.report.diagnosis import Diagnosis
 from neuido.errors import one_line
-from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
-from neuido.models.render.gaussians import attach_gaussians, save_ply
+from neuido.models.inference.outputs import contact_sheet, write_particles, write_video
+from neuido.models.render.gaussians import attach_gaussians, save_gaussians
 from neuido.types import ParticleState
 from tests.faults.readers import READERS
 
@@ -43,8 +43,8 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "copy": lambda path: copy_file(__file__, path),
     "video": lambda path: write_video(path.with_suffix(".mp4"), NOISE),
     "contact sheet": lambda path: contact_sheet(path, [NOISE]),
-    "point clouds": lambda path: write_plys(path.parent, ParticleState(X, X, None, None)),  # type: ignore[arg-type]
-    "Gaussians": lambda path: save_ply(path, attach_gaussians(X[0], torch.full((4000,), 1e-6))),
+    "point clouds": lambda path: write_particles(path.parent, ParticleState(X, X, None, None)),  # type: ignore[arg-type]
+    "Gaussians": lambda path: save_gaussians(path, attach_gaussians(X[0], torch.full((4000,), 1e-6))),
     "report": _report,
 }
 

@@ -11,7 +11,7 @@ from neuido.data.bodies.shapes import ball, box
 from neuido.data.cameras import orbit
 from neuido.data.scenes.filmed_scene import Truth, VisualScene
 from neuido.data.scenes.filmed_scene_module import SequentialScenes, ShuffledScenes, ordered_loader
-from neuido.models.render.gaussians import deform, harmonics_of, save_ply
+from neuido.models.render.gaussians import deform, harmonics_of, save_gaussians
 from neuido.models.render.splatting import render
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material
@@ -60,7 +60,7 @@ def tiny_scene(
     covariance = ((0.6 * spacing) ** 2 * torch.eye(3)).expand(count, 3, 3).contiguous()
     gaussians = Gaussians(body.x, covariance, torch.full((count,), 0.95), harmonics_of(colours))
     folder.mkdir(parents=True, exist_ok=True)
-    save_ply(folder / f"{name}.ply", gaussians)
+    save_gaussians(folder / f"{name}.ply", gaussians)
     cameras = orbit(views, target=(0.5, 0.3, 0.5), radius=2.2, angle=28.0, elevations=(12.0, 30.0), width=width, height=width)
     with torch.no_grad():
         images, alphas = render(deform(gaussians, motion.F, motion.x), cameras, background=torch.ones(3))

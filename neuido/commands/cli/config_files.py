@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from neuido import configs_root
 from neuido.data.files.yaml_files import chain, read_configuration, shipped
 from neuido.errors import UserError
+from neuido.installation import configs_root
 
 OPTIONS = ("-c", "--config")
 

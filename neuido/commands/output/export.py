@@ -122,9 +122,9 @@ def _motion(
     if target.suffix.lower() in (".npz", ".csv") and law is None:
         chosen = ()
     if gaussians is not None:
-        from neuido.models.render.gaussians import load_ply
+        from neuido.models.render.gaussians import load_gaussians
 
-        options["gaussians"] = load_ply(gaussians, device="cpu")
+        options["gaussians"] = load_gaussians(gaussians, device="cpu")
     if cameras is not None:
         options["cameras"] = neuido.read_recording(cameras).cameras
     made = neuido.export(run.motion, target, law=chosen, scene=run.scene, **options)

@@ -12,11 +12,11 @@ from typing import Any
 
 import yaml
 
-from neuido import configs_root
 from neuido.commands.cli.config_files import given_configs, in_place, inline, is_content
 from neuido.data.trajectories.options import Throw, make_trajectories
 from neuido.data.undeclared import Case
 from neuido.errors import UserError
+from neuido.installation import configs_root
 
 THROW = tuple(field.name for field in fields(Throw))
 CASE = tuple(field.name for field in fields(Case))

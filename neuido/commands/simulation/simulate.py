@@ -4,11 +4,11 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
-from neuido import configs_root
 from neuido.data.files.output_folder import check_unused
 from neuido.data.files.writing import copy_file, new_folder, write_text
 from neuido.data.progress import Progress
 from neuido.errors import UserError
+from neuido.installation import configs_root
 from neuido.physics.runtime.limits import check_limit
 
 FRAMES = 100

@@ -1,0 +1,5 @@
+"""Bodies and scenes: shapes, meshes, skins, files of scenes."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from neuido import configs_root
+from neuido.installation import configs_root
 
 
 def weights_hint(path: str | os.PathLike, option: str = "init_from") -> str:

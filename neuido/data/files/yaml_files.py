@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from neuido import configs_root
 from neuido.data.files.parsing import naming, read_text, read_yaml
 from neuido.errors import UserError
+from neuido.installation import configs_root
 
 Keys = tuple[str | int, ...]
 """Names of keys and numbers of list entries, outermost first."""

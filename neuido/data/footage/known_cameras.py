@@ -13,7 +13,7 @@ from neuido.data.footage.filming import SAME_ASPECT, Filming, View, chosen_frame
 from neuido.data.footage.video_frames import Clip, images
 from neuido.data.formats import colmap
 from neuido.data.formats.layout import MultiView
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 from neuido.physics.runtime.lazy import import_extra
 
@@ -28,7 +28,7 @@ def recorded_cameras(path: Path, clips: Sequence[Clip]) -> tuple[list[View], lis
     Raises:
         UserError: The recording cannot be read, a clip has no view of its name, or the image sizes have other aspect ratios.
     """
-    found = read(path)
+    found = read_recording(path)
     return _of_views(found, clips, f"--cameras {path}"), [f"cameras of {path} ({found.format})"]
 
 

@@ -8,7 +8,7 @@ from neuido.data.footage.contact_sheet import Sheet
 from neuido.data.footage.filming import Filming
 from neuido.data.footage.view_recording import write_views
 from neuido.data.importers.tables.checked_folder import write_checked
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 
 
@@ -51,7 +51,7 @@ def write_view_folder(
             )
         )
 
-    write_checked(out, fill, read)
+    write_checked(out, fill, read_recording)
     if out is not None:
         config = f"neuido predict --config configs/predict.yaml --data.scenes [{out}]"
         summary.append(f"next: neuido check {out}; neuido reconstruct {out}; {config}")

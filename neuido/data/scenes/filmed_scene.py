@@ -36,7 +36,7 @@ from neuido.data.files.writing import write_text
 from neuido.data.files.yaml_files import checking
 from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 from neuido.types import Body, MultiViewBatch, Scene, Vector
 
@@ -178,7 +178,7 @@ def load_views(
     Raises:
         UserError: As `read_recording` and `SceneViews`.
     """
-    found = read(folder, recording=recording, frame_interval=frame_interval)
+    found = read_recording(folder, recording=recording, frame_interval=frame_interval)
     views = SceneViews(found, scale=placing.scale, shift=placing.shift, up=placing.up, cache=False, find_masks=True, **options)
     pairs = [(v, t) for v in range(len(views.chosen)) for t in range(len(views.frames))]
     shape = (len(views.chosen), len(views.frames), views.cameras.height, views.cameras.width)

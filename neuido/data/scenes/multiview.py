@@ -17,7 +17,7 @@ from neuido.data.files.parsing import read_image
 from neuido.data.files.values import number
 from neuido.data.formats.layout import SAME_SHAPE, MultiView, read_matrix
 from neuido.data.scenes.masks import mask_channel, mask_from_empty, mask_on_plain_background, rim_colour
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError, suggest
 from neuido.types import Cameras, MultiViewBatch, Vector
 
@@ -342,7 +342,7 @@ class MultiViewDataModule(LightningDataModule):
                 raise UserError(f"unknown key {key!r} in {where}{suggest(str(key), known) or ';'} it takes {', '.join(known)}")
         reading = {key: options.pop(key) for key in known[:4] if key in options}
         try:
-            return SceneViews(read(reading.pop("path"), reading.pop("format", "auto"), **reading), **self.options, **options)
+            return SceneViews(read_recording(reading.pop("path"), reading.pop("format", "auto"), **reading), **self.options, **options)
         except UserError as error:
             raise UserError(f"{where}: {error}") from error
 

@@ -9,7 +9,7 @@ from neuido.data.formats.layout import MultiView
 from neuido.data.measured import experiment_video
 from neuido.errors import UserError
 
-__all__ = ["FORMATS", "MultiView", "detect", "read"]
+__all__ = ["FORMATS", "MultiView", "detect", "read_recording"]
 
 MARKS = {
     "experiment": ("experiment.yaml",),
@@ -31,7 +31,9 @@ READERS = {
 }
 
 
-def read(path: str | os.PathLike, format: str = "auto", *, recording: str | None = None, frame_interval: float | None = None) -> MultiView:
+def read_recording(
+    path: str | os.PathLike, format: str = "auto", *, recording: str | None = None, frame_interval: float | None = None
+) -> MultiView:
     """Read a multi-view recording: cameras, times and the paths of its images.
 
     Args:

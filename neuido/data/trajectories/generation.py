@@ -257,7 +257,7 @@ def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
 
 
 def _write_index(folder: Path, setup: Setup, instances: list[Instance]) -> None:
-    from neuido import __version__
+    from neuido.installation import __version__
 
     files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
     entries = [{**asdict(i), **_statistics(files[i.name]), "sha256": sha256_of(files[i.name])} for i in instances]

@@ -16,7 +16,7 @@ from neuido.data.scenes.multiview import SceneViews
 from neuido.discrepancy.problems.silhouettes import LEVEL, usable
 from neuido.errors import UserError
 from neuido.models.reconstruct.filling import fill, visual_hull
-from neuido.models.render.gaussians import bind, deform, load_ply
+from neuido.models.render.gaussians import bind, deform, load_gaussians
 from neuido.models.render.splatting import rasterize
 from neuido.types import Body, Cameras, ParticleState
 
@@ -87,7 +87,7 @@ class Splats:
     """
 
     def __init__(self, path, body: Body, device: str) -> None:
-        self.gaussians = load_ply(path, device=device)
+        self.gaussians = load_gaussians(path, device=device)
         self.binding = bind(self.gaussians, body.x.to(device, torch.float32))
         self.back = None if body.F is None else torch.linalg.inv(body.F.to(device, torch.float32))
 

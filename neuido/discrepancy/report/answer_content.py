@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-import neuido
 from neuido.discrepancy.inference.floors import Part, Round, Trial, unphysical
 from neuido.discrepancy.inference.power import Compatible
 from neuido.discrepancy.inference.search.attribution import Diagnosis
@@ -18,8 +17,9 @@ from neuido.discrepancy.report import ceiling, next_experiment, residual
 from neuido.discrepancy.report.reader_units import reach
 from neuido.discrepancy.report.wording import title
 from neuido.errors import UserError
+from neuido.installation import __version__
 
-VERSION = neuido.__version__
+VERSION = __version__
 UNSURE = ("insufficient", "unknown")
 P_VALUE = "chance of the largest gain over all effects in a linear model of the fits, without the search and the refits of its draws"
 """Meaning of the p-value. Fits are not linear, and a search tries more than one start."""

@@ -16,7 +16,7 @@ from neuido.errors import UserError
 from neuido.types import ParticleState
 
 
-def write_plys(folder: str | os.PathLike, motion: ParticleState, times: Tensor | None = None) -> None:
+def write_particles(folder: str | os.PathLike, motion: ParticleState, times: Tensor | None = None) -> None:
     """Write the particles of each frame to `000.ply`, `001.ply`, ... with x, y, z [m] and vx, vy, vz [m/s].
 
     Args:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuido.data.scenes.filmed_scene import VisualScene
 from neuido.errors import UserError
-from neuido.models.render.gaussians import Binding, attach_gaussians, bind, load_ply
+from neuido.models.render.gaussians import Binding, attach_gaussians, bind, load_gaussians
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow import as_bytes, frame_interval_of
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
@@ -138,7 +138,7 @@ def prepare(
         rest = simulator.volume / torch.linalg.det(simulator.state.F)  # a body may start deformed
         gaussians, binding = attach_gaussians(simulator.state.x, rest), None
     else:
-        gaussians = load_ply(scene.gaussians, device=device)
+        gaussians = load_gaussians(scene.gaussians, device=device)
         binding = bind(gaussians, simulator.state.x)
     return PreparedScene(
         source=scene,

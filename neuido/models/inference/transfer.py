@@ -27,7 +27,7 @@ from neuido.data.files.score_tables import folder_of
 from neuido.data.files.values import check_keys, vector
 from neuido.data.files.yaml_files import located
 from neuido.errors import UserError
-from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
+from neuido.models.inference.outputs import contact_sheet, write_particles, write_video
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
 from neuido.models.render.gaussians import attach_gaussians, bind, colours_of, deform
 from neuido.models.render.splatting import render
@@ -146,7 +146,7 @@ def run_condition(condition: Condition, known: list[tuple[PreparedScene, Laws]],
     with torch.no_grad():
         images = render(gaussians, first.views([first.scoring_views[0]]).at(0), background=first.background)[0][:, 0]
     folder = folder_of(out, f"condition-{condition.name}")
-    write_plys(folder / "particles", motion, motion.times)
+    write_particles(folder / "particles", motion, motion.times)
     write_video(folder / "video.mp4", images)
     contact_sheet(folder / "video.png", [images])
     return folder

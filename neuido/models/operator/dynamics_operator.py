@@ -277,6 +277,10 @@ class IntrinsicDynamicsOperator(nn.Module):
         return operator
 
 
+Operator = IntrinsicDynamicsOperator
+"""The short public name."""
+
+
 def _effective(trunk: Trunk, coefficients: Tensor) -> list[Tensor]:
     shared = [t[None] for layer in (trunk.fc1, trunk.fc2) for t in affine(layer)]
     return [*shared, *trunk.contract(coefficients)]

@@ -8,7 +8,7 @@ import torch
 from neuido.data.neighbours.neighbour_scene import Placement
 from neuido.errors import UserError
 from neuido.models.reconstruct.filling import fill, opacity_volume
-from neuido.models.render.gaussians import load_ply
+from neuido.models.render.gaussians import load_gaussians
 from neuido.physics.runtime.limits import check_limit
 from neuido.types import Gaussians
 
@@ -36,7 +36,7 @@ def place_gaussians(path: str | os.PathLike, placement: Placement, *, opacity: f
     Raises:
         UserError: The file cannot be read, or no Gaussian is left.
     """
-    given = load_ply(path, dtype=torch.float64, device="cpu")
+    given = load_gaussians(path, dtype=torch.float64, device="cpu")
     turn = torch.as_tensor(np.asarray(placement.rotation, np.float64))
     means = given.means @ turn.T
     kept = given.opacities > opacity

@@ -191,7 +191,7 @@ def scales_and_quaternions(covariances: Tensor) -> tuple[Tensor, Tensor]:
     return values.clamp(min=0).sqrt().to(covariances), quaternions.to(covariances)
 
 
-def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
+def save_gaussians(path: str | PathLike, gaussians: Gaussians) -> None:
     """Write a 3DGS PLY file (`point_cloud.ply`): logit opacities, log scales, quaternions wxyz, and harmonics by channel.
 
     Raises:
@@ -212,7 +212,7 @@ def save_ply(path: str | PathLike, gaussians: Gaussians) -> None:
         hidden.write_bytes(ply_bytes(vertices))
 
 
-def load_ply(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:
+def load_gaussians(path: str | PathLike, *, dtype: torch.dtype = torch.float32, device: str | torch.device = "auto") -> Gaussians:
     """Read a 3DGS PLY file; rows that are not finite are skipped with a warning.
 
     Args:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuido.data.files.score_tables import write_rows
 from neuido.errors import UserError
-from neuido.models.inference.outputs import contact_sheet, write_plys, write_video
+from neuido.models.inference.outputs import contact_sheet, write_particles, write_video
 from neuido.models.inference.pipeline import render_motion
 from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.models.scoring import motion_scores as scores
@@ -130,6 +130,6 @@ def write_prediction(folder: Path, prepared: PreparedScene, motion: ParticleStat
     """Write the particles, and a video and contact sheet that compare recorded and predicted frames in one scoring view."""
     view = prepared.scoring_views[0]
     images, recorded = render_motion(prepared, motion, [view])[0][:, 0], prepared.recorded([view])[:, 0]
-    write_plys(folder / "particles", motion, prepared.times(len(motion.x)))
+    write_particles(folder / "particles", motion, prepared.times(len(motion.x)))
     write_video(folder / "prediction.mp4", torch.cat([recorded, images], 2))
     contact_sheet(folder / "prediction.png", [recorded, images])

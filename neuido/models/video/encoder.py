@@ -299,3 +299,7 @@ class DynamicsEncoder(nn.Module):
             raise UserError(f"encoder: {file}: its projector takes {fitted.config['channels']} channels, its VAE {encoder.vae.channels}")
         encoder.projector, encoder.card = fitted, card
         return encoder
+
+
+Encoder = DynamicsEncoder
+"""The short public name."""

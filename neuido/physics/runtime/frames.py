@@ -4,7 +4,6 @@ import functools
 import os
 import re
 from collections.abc import Iterable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +154,7 @@ class Frames(ParticleState):
         path = Path(path)
         writers = {".npz": self._save_npz, ".ply": self._save_ply, ".csv": self._save_csv}
         if path.suffix.lower() not in writers:
-            return [neuido.export(self, path)]
+            return [neuido.export(self, path)]  # by its public name: physics does not know the rooms above it
         return writers[path.suffix.lower()](path)
 
     def show(self, *, law: Any = None, scene: Any = None, colour: str | None = None, height: int = 480) -> Any:
@@ -173,8 +172,7 @@ class Frames(ParticleState):
         Raises:
             UserError: The extra `viewer` is missing, or the frames have no such quantity.
         """
-        player = import_module("neuido.viewer.notebook")  # the viewer shows physics, which must not need it
-        return player.player_of(self, law=law, scene=scene, colour=colour, height=height)
+        return neuido.show(self, law=law, scene=scene, colour=colour, height=height)
 
     def _scene(self) -> np.ndarray:
         """Return the scene of each particle, (P,)."""

@@ -11,14 +11,14 @@ from neuido.data import cameras as convert
 from neuido.data.formats import colmap, nerfstudio, neuma, springgaus
 from neuido.data.formats.layout import MultiView
 from neuido.data.scenes.multiview import SceneViews
-from neuido.data.scenes.readers import FORMATS, read
+from neuido.data.scenes.readers import FORMATS, read_recording
 from neuido.errors import UserError
 from tests.data import samples
 
 S = samples.Sample()
 EXACT, JPEG = 0, 40  # grey levels; a JPEG of so few pixels and so much colour is rough
 
-CASES = {  # writer, format, options of read, names of the views, held out, interval, colours within, has masks
+CASES = {  # writer, format, options of read_recording, names of the views, held out, interval, colours within, has masks
     "nerfstudio": (samples.nerfstudio, "nerfstudio", {}, ("0", "1", "2"), (), 0.02, EXACT, True),
     "blender": (samples.blender, "nerfstudio", {}, ("0", "1", "2"), (2,), 0.02, EXACT, True),
     "neuma": (samples.neuma_synthetic, "neuma", {"frame_interval": 0.02}, ("d_0", "d_1", "e_0"), (2,), 0.02, EXACT, True),
@@ -36,7 +36,7 @@ CASES = {  # writer, format, options of read, names of the views, held out, inte
 
 def made(tmp_path, case: str) -> MultiView:
     writer, format, options, *_ = CASES[case]
-    return read(writer(tmp_path / case, S), format, **options)
+    return read_recording(writer(tmp_path / case, S), format, **options)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -65,17 +65,17 @@ def test_sample_of_each_format(tmp_path, case):
 @pytest.mark.parametrize("case", CASES)
 def test_format_is_found(tmp_path, case):
     writer, format, options, *_ = CASES[case]
-    assert read(writer(tmp_path / case, S), **options).format == format
+    assert read_recording(writer(tmp_path / case, S), **options).format == format
 
 
 def test_unknown_format(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"format of .* is unknown"):
-        read(tmp_path / "empty")
+        read_recording(tmp_path / "empty")
     with pytest.raises(UserError, match="format = 'kitti'"):
-        read(tmp_path / "empty", "kitti")
+        read_recording(tmp_path / "empty", "kitti")
     with pytest.raises(UserError, match=r"folder .* is missing"):
-        read(tmp_path / "nowhere")
+        read_recording(tmp_path / "nowhere")
     assert set(FORMATS) == {"experiment", "pacnerf", "neuma", "springgaus", "nerfstudio", "colmap"}
 
 
@@ -105,7 +105,7 @@ def test_malformed_json(tmp_path, case, text):
     made(tmp_path, case)
     (tmp_path / case / JSON_FILES[case]).write_text(text)
     with pytest.raises(UserError) as caught:
-        read(tmp_path / case, CASES[case][1], **CASES[case][2])
+        read_recording(tmp_path / case, CASES[case][1], **CASES[case][2])
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400
 
 
@@ -126,7 +126,7 @@ def test_images_stay_in_the_folder(tmp_path, case, name):
     samples.png(tmp_path / "secret.png", S.images[0, 0])
     edit(tmp_path / case / JSON_FILES[case], lambda c: FRAMES[case](c).update(file_path=name))
     with pytest.raises(UserError, match=r"leaves the folder|must be the path"):
-        read(tmp_path / case, CASES[case][1], **CASES[case][2])
+        read_recording(tmp_path / case, CASES[case][1], **CASES[case][2])
 
 
 def test_a_link_out_of_the_folder(tmp_path):
@@ -136,23 +136,23 @@ def test_a_link_out_of_the_folder(tmp_path):
     picture.unlink()
     picture.symlink_to(tmp_path / "secret.png")
     with pytest.raises(UserError, match="leaves the folder"):
-        read(tmp_path / "nerfstudio")
+        read_recording(tmp_path / "nerfstudio")
 
 
 def test_names_in_other_files_stay_in_the_folder(tmp_path):
     made(tmp_path, "springgaus")
     edit(tmp_path / "springgaus" / "camera.json", lambda c: c[0].update(camera="../elsewhere"))
     with pytest.raises(UserError, match="leaves the folder"):
-        read(tmp_path / "springgaus")
+        read_recording(tmp_path / "springgaus")
     made(tmp_path, "springgaus-real")
     edit(tmp_path / "springgaus-real" / JSON_FILES["springgaus-real"], lambda c: c["C0787"].__setitem__(0, "../../x.jpg"))
     with pytest.raises(UserError, match="leaves the folder"):
-        read(tmp_path / "springgaus-real")
+        read_recording(tmp_path / "springgaus-real")
     made(tmp_path, "colmap")
     file = tmp_path / "colmap" / "sparse" / "0" / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"IMG_0.png", b"../0_.png"))
     with pytest.raises(UserError, match="leaves the folder"):
-        read(tmp_path / "colmap")
+        read_recording(tmp_path / "colmap")
 
 
 @pytest.mark.parametrize("case", FRAMES)
@@ -173,7 +173,7 @@ def test_a_wrong_pose(tmp_path, case, matrix, message):
     key = "transform_matrix" if case in ("nerfstudio", "blender") else "c2w"
     edit(tmp_path / case / JSON_FILES[case], lambda c: FRAMES[case](c).update({key: matrix}))
     with pytest.raises(UserError, match=f"{key}.*{message}"):
-        read(tmp_path / case, CASES[case][1], **CASES[case][2])
+        read_recording(tmp_path / case, CASES[case][1], **CASES[case][2])
 
 
 @pytest.mark.parametrize(
@@ -205,44 +205,44 @@ def test_malformed_transforms(tmp_path, change, message):
     made(tmp_path, "nerfstudio")
     edit(tmp_path / "nerfstudio" / "transforms.json", change)
     with pytest.raises(UserError, match=message):
-        read(tmp_path / "nerfstudio")
+        read_recording(tmp_path / "nerfstudio")
 
 
 def test_other_formats_say_what_is_missing(tmp_path):
     made(tmp_path, "neuma")
     with pytest.raises(UserError, match="give frame_interval"):
-        read(tmp_path / "neuma")
+        read_recording(tmp_path / "neuma")
     ball = samples.neuma_synthetic(tmp_path / "BouncyBall", S)
-    assert float(read(ball).times[1]) == 1e-3
+    assert float(read_recording(ball).times[1]) == 1e-3
 
     made(tmp_path, "pacnerf")
     edit(tmp_path / "pacnerf" / "all_data.json", lambda c: c.pop())
     with pytest.raises(UserError, match="camera 2 lacks frame 3"):
-        read(tmp_path / "pacnerf")
+        read_recording(tmp_path / "pacnerf")
     edit(tmp_path / "pacnerf" / "all_data.json", lambda c: c[3].update(file_path="data/frame.png"))
     with pytest.raises(UserError, match="must have the form"):
-        read(tmp_path / "pacnerf")
+        read_recording(tmp_path / "pacnerf")
 
     made(tmp_path, "neuma-real")
     edit(tmp_path / "neuma-real" / "cameras_calib.json", lambda c: c.pop("r_1"))
     with pytest.raises(UserError, match="lacks the view 'r_1'"):
-        read(tmp_path / "neuma-real")
+        read_recording(tmp_path / "neuma-real")
     (tmp_path / "neuma-real" / "sparse" / "0" / "cameras.bin").unlink()
     with pytest.raises(UserError, match=r"cameras.bin is missing"):
-        read(tmp_path / "neuma-real")
+        read_recording(tmp_path / "neuma-real")
 
     made(tmp_path, "springgaus")
     (tmp_path / "springgaus" / "cam_1" / "002.png").unlink()
     with pytest.raises(UserError, match="camera cam_1 lacks frame 2"):
-        read(tmp_path / "springgaus")
+        read_recording(tmp_path / "springgaus")
 
     real = samples.springgaus_real(tmp_path / "real", S)
     (real / "dynamic" / "videos_masks" / "C0787" / "C0787_101.png").unlink()
     with pytest.raises(UserError, match=r"C0787_101.png is missing"):
-        read(real)
+        read_recording(real)
     samples.dump(real / "dynamic" / "sequences" / "dog" / "1.json", {"C0733": ["a.jpg"]})
     with pytest.raises(UserError, match="choose from bun/0, dog/1"):
-        read(real)
+        read_recording(real)
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin"])
@@ -253,7 +253,7 @@ def test_colmap_cut_short_anywhere(tmp_path, file):
     for length in range(0, len(whole), 7):
         path.write_bytes(whole[:length])
         with pytest.raises(UserError, match="truncated"):
-            read(tmp_path / "colmap")
+            read_recording(tmp_path / "colmap")
 
 
 def test_colmap_with_what_it_cannot_mean(tmp_path):
@@ -261,15 +261,15 @@ def test_colmap_with_what_it_cannot_mean(tmp_path):
     cameras = tmp_path / "colmap" / "sparse" / "0" / "cameras.bin"
     cameras.write_bytes(struct.pack("<QiiQQ", 1, 1, 5, 24, 16) + struct.pack("<8d", *8 * [1.0]))
     with pytest.raises(UserError, match="not a pinhole"):
-        read(tmp_path / "colmap")
+        read_recording(tmp_path / "colmap")
     cameras.write_bytes(struct.pack("<QiiQQ8d", 1, 1, 4, 24, 16, 30, 31, 12, 8, 0.1, 0.2, 0.3, 0.4))
-    found = read(tmp_path / "colmap")
+    found = read_recording(tmp_path / "colmap")
     assert found.distortion is not None and found.distortion[0].tolist() == [0.1, 0.2, 0.3, 0.4, 0.0]
     assert found.cameras.Ks[0].diagonal().tolist() == [30, 31, 1]
     images = tmp_path / "colmap" / "sparse" / "0" / "images.bin"
     images.write_bytes(struct.pack("<Q", 2**60))
     with pytest.raises(UserError, match="truncated"):
-        read(tmp_path / "colmap")
+        read_recording(tmp_path / "colmap")
 
 
 # What a format can do besides.
@@ -279,12 +279,12 @@ def test_transforms_without_view_are_grouped_by_pose(tmp_path):
     made(tmp_path, "nerfstudio")
     file = tmp_path / "nerfstudio" / "transforms.json"
     edit(file, lambda c: [frame.pop("view") for frame in c["frames"]])
-    assert [len(row) for row in read(file).images] == [4, 4, 4]
+    assert [len(row) for row in read_recording(file).images] == [4, 4, 4]
     edit(file, lambda c: [frame.pop("time") for frame in c["frames"]])
-    found = read(file, frame_interval=0.5)
+    found = read_recording(file, frame_interval=0.5)
     assert found.times.tolist() == [0, 0.5, 1.0, 1.5] and found.images[1][2].name == "1_002.png"
     edit(file, lambda c: c.update(frames=c["frames"][::4]))
-    assert len(read(file).times) == 1 and len(read(file).views) == 3
+    assert len(read_recording(file).times) == 1 and len(read_recording(file).views) == 3
 
 
 def test_monocular_recordings_are_one_camera_that_moves(tmp_path):
@@ -293,11 +293,11 @@ def test_monocular_recordings_are_one_camera_that_moves(tmp_path):
     shutil.copytree(tmp_path / "nerfstudio", tmp_path / "nerfstudio-whole")
     file = tmp_path / "nerfstudio" / "transforms.json"
     edit(file, lambda c: c.update(frames=[{k: v for k, v in c["frames"][i].items() if k != "view"} for i in (0, 5, 10)]))
-    whole, found = read(tmp_path / "nerfstudio-whole"), read(file)
+    whole, found = read_recording(tmp_path / "nerfstudio-whole"), read_recording(file)
     assert [path and path.name for path in found.images[0]] == ["0_000.png", "1_001.png", "2_002.png"] and len(found.images) == 1
     torch.testing.assert_close(found.cameras.viewmats[0], whole.cameras.viewmats)
     edit(file, lambda c: [frame.update(view=i) for i, frame in enumerate(c["frames"])])
-    found = read(file)
+    found = read_recording(file)
     assert [[path is not None for path in row] for row in found.images] == [[v == t for t in range(3)] for v in range(3)]
 
 
@@ -306,7 +306,7 @@ def test_full_lens_of_nerfstudio(tmp_path):
     file = tmp_path / "nerfstudio" / "transforms.json"
     edit(file, lambda c: c.update(fl_x=31.0, fl_y=29.0, cx=11.0, cy=9.5, k1=0.1, p2=0.01))
     edit(file, lambda c: c["frames"][-1].update(mask_path="images/0_000.png"))
-    found = read(file)
+    found = read_recording(file)
     np.testing.assert_allclose(found.cameras.Ks[1], [[31, 0, 11], [0, 29, 9.5], [0, 0, 1]])
     assert found.distortion is not None and found.distortion[2].tolist() == [0.1, 0, 0, 0.01, 0]
     assert found.masks is not None and found.masks[0][0] is None and found.masks[2][3].name == "0_000.png"
@@ -317,7 +317,7 @@ def test_nerfstudio_write_and_read(tmp_path):
     cameras = cameras._replace(Ks=cameras.Ks + torch.tensor([[0, 0, 1.5], [0, 2.0, -0.5], [0, 0, 0]]))
     times = torch.tensor([0.0, 0.035805, 0.068422, 0.1], dtype=torch.float64)
     nerfstudio.write(tmp_path, cameras, times, S.images, views=["0", "3", "12"], held_out=[1])
-    found = read(tmp_path)
+    found = read_recording(tmp_path)
     assert found.views == ("0", "3", "12") and found.held_out == (1,)
     assert torch.equal(found.times, times)
     torch.testing.assert_close(found.cameras.viewmats, cameras.viewmats, atol=1e-6, rtol=0)
@@ -335,7 +335,7 @@ def test_nerfstudio_write_and_read(tmp_path):
 def test_pacnerf_of_gic(tmp_path):
     folder = samples.pacnerf(tmp_path / "torus", S, segmented=True)
     (folder / "transforms_test.json").write_text("{}")
-    found = read(folder)
+    found = read_recording(folder)
     assert found.format == "pacnerf" and found.held_out == (0,)
     assert found.images[1][2].name == "a_1_2.png"
     assert [path.name for path in found.backgrounds] == ["r_0_-1.png", "r_1_-1.png", "r_2_-1.png"]

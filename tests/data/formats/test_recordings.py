@@ -15,7 +15,7 @@ from neuido.data.files.values import path_inside
 from neuido.data.formats import colmap, nerfstudio
 from neuido.data.scenes.filmed_scene import load_views
 from neuido.data.scenes.multiview import SceneViews
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 
 WIDTH, HEIGHT = 31, 20
@@ -42,7 +42,7 @@ def folder(path: Path, *, views: int = 3, frames: int = 1, root=None, each=lambd
 
 def test_angles_of_view_of_both_sides(tmp_path):
     angles = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / 25), "camera_angle_y": 2 * np.arctan(HEIGHT / 2 / 35)}
-    found = read(folder(tmp_path, each=lambda v, t: angles))  # a frame's angles come before the file's fl_x
+    found = read_recording(folder(tmp_path, each=lambda v, t: angles))  # a frame's angles come before the file's fl_x
     assert torch.allclose(found.cameras.Ks[0], torch.tensor([[25.0, 0, WIDTH / 2], [0, 35.0, HEIGHT / 2], [0, 0, 1]]), atol=1e-4)
 
 
@@ -51,19 +51,19 @@ def test_angles_of_view_of_both_sides(tmp_path):
 def test_terms_of_lenses_that_are_not_applied(tmp_path, key, frame):
     extra = {key: True if key == "is_fisheye" else 0.3}
     with pytest.raises(UserError, match=rf"frames\[0\].{key} = .*undistort the images first"):
-        read(folder(tmp_path, root={} if frame else extra, each=lambda v, t: extra if frame else {}))
+        read_recording(folder(tmp_path, root={} if frame else extra, each=lambda v, t: extra if frame else {}))
     absent = {key: False if key == "is_fisheye" else 0.0}
-    assert read(folder(tmp_path, root=absent)).distortion is None
+    assert read_recording(folder(tmp_path, root=absent)).distortion is None
 
 
 def test_list_of_distortion_parameters(tmp_path):
-    found = read(folder(tmp_path, root={"distortion_params": [0.1, 0.2, 0.3, 0.0, 0.4, 0.5]}))
+    found = read_recording(folder(tmp_path, root={"distortion_params": [0.1, 0.2, 0.3, 0.0, 0.4, 0.5]}))
     assert found.distortion[0].tolist() == [0.1, 0.2, 0.4, 0.5, 0.3]
     for values, match in (([0.1, 0, 0, 0.2, 0, 0], "k4 = 0.2"), ([0.1], "shape"), ("x", "must contain numbers")):
         with pytest.raises(UserError, match=match):
-            read(folder(tmp_path, root={"distortion_params": values}))
+            read_recording(folder(tmp_path, root={"distortion_params": values}))
     with pytest.raises(UserError, match="contradicts distortion_params"):
-        read(folder(tmp_path, root={"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}))
+        read_recording(folder(tmp_path, root={"distortion_params": [0.1, 0, 0, 0, 0, 0], "k1": 0.2}))
 
 
 def test_transposed_matrix(tmp_path):
@@ -72,13 +72,13 @@ def test_transposed_matrix(tmp_path):
     content["frames"][1]["transform_matrix"] = np.array(content["frames"][1]["transform_matrix"]).T.tolist()
     (path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(UserError, match=r"frames\[1\].transform_matrix has the last row .*, not 0, 0, 0, 1: .*write it row by row"):
-        read(path)
+        read_recording(path)
 
 
 def test_windows_separators_and_byte_order_mark(tmp_path):
     path = folder(tmp_path, each=lambda v, t: {"file_path": f"images\\{v}_{t}.png"})
     (path / "transforms.json").write_bytes(b"\xef\xbb\xbf" + (path / "transforms.json").read_bytes())
-    assert [row[0].name for row in read(path).images] == ["0_0.png", "1_0.png", "2_0.png"]
+    assert [row[0].name for row in read_recording(path).images] == ["0_0.png", "1_0.png", "2_0.png"]
     for name in ("..\\a.png", "C:\\a.png", "\\\\host\\a.png", "images\\..\\..\\a.png"):
         with pytest.raises(UserError, match="leaves the folder"):
             path_inside(path, name, "it")
@@ -111,7 +111,7 @@ def test_encodings_of_masks(tmp_path, name):
     for v in range(3):
         mask = masks_of(name)
         mask.save(path / f"{v}.png") if name == "palette" else cv2.imwrite(str(path / f"{v}.png"), mask)
-    _, masks = SceneViews(read(path)).load(range(3))
+    _, masks = SceneViews(read_recording(path)).load(range(3))
     assert masks.mean(dim=(1, 2, 3)).tolist() == pytest.approx([float(ellipse().mean())] * 3, abs=1e-6)
 
 
@@ -119,7 +119,7 @@ def test_labels_of_several_objects_are_no_mask(tmp_path):
     path = folder(tmp_path, each=lambda v, t: {"mask_path": "m.png"})
     cv2.imwrite(str(path / "m.png"), ellipse() + (np.arange(WIDTH) > 20))
     with pytest.raises(UserError, match=r"m.png has the values 0, 1, 2: labels of several objects"):
-        SceneViews(read(path)).load([0])
+        SceneViews(read_recording(path)).load([0])
 
 
 @pytest.mark.parametrize("k1", [-0.3, 0.0, 0.2])
@@ -139,17 +139,17 @@ def test_each_image_has_its_own_way_to_a_mask(tmp_path):
 
 def test_sizes_that_differ_per_view(tmp_path):
     path = folder(tmp_path, size=lambda v: (WIDTH * (1 + (v == 1)), HEIGHT * (1 + (v == 1))))
-    found = read(path)
+    found = read_recording(path)
     assert (found.cameras.width, found.cameras.height) == (WIDTH, HEIGHT)
     assert found.cameras.Ks[:, 0, 0].tolist() == [40.0, 20.0, 40.0]
     masks = load_views(path).masks
     assert masks.mean(dim=(1, 2, 3)).tolist() == pytest.approx([float(ellipse().mean())] * 3, abs=0.01)
     with pytest.raises(UserError, match="crop the images of all views to one aspect ratio"):
-        read(folder(tmp_path, size=lambda v: (WIDTH, HEIGHT) if v else (HEIGHT, WIDTH)))
+        read_recording(folder(tmp_path, size=lambda v: (WIDTH, HEIGHT) if v else (HEIGHT, WIDTH)))
 
 
 def test_shutters_that_differ_by_milliseconds(tmp_path):
-    found = read(folder(tmp_path, frames=4, each=lambda v, t: {"view": v, "time": t / 30 + 0.003 * v}))
+    found = read_recording(folder(tmp_path, frames=4, each=lambda v, t: {"view": v, "time": t / 30 + 0.003 * v}))
     assert [len(row) for row in found.images] == [4, 4, 4] and None not in found.images[2]
     assert torch.allclose(found.times, torch.arange(4).double() / 30 + 0.003, atol=1e-9)
 
@@ -167,7 +167,7 @@ def model(path: Path, lines: str, *, names=("a.png", "b.png"), place: str = "spa
 
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
 def test_colmap_text_in_each_layout(tmp_path, place):
-    found = read(model(tmp_path / "m", f"1 PINHOLE {WIDTH} {HEIGHT} 40 41 15 10", place=place))
+    found = read_recording(model(tmp_path / "m", f"1 PINHOLE {WIDTH} {HEIGHT} 40 41 15 10", place=place))
     assert found.format == "colmap" and found.views == ("a.png", "b.png")
     assert found.cameras.Ks[0].tolist() == [[40, 0, 15], [0, 41, 10], [0, 0, 1]]
     assert found.cameras.viewmats[1, 2, 3] == 2 and float(found.cameras.viewmats[0, :3, :3].det()) == pytest.approx(1)
@@ -188,7 +188,7 @@ def test_colmap_text_in_each_layout(tmp_path, place):
 )
 def test_malformed_colmap_text(tmp_path, line, match):
     with pytest.raises(UserError, match=match):
-        read(model(tmp_path / "m", line))
+        read_recording(model(tmp_path / "m", line))
 
 
 @pytest.mark.parametrize("ending", [".png.png", ".png"])

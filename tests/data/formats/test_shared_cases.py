@@ -8,7 +8,7 @@ import torch
 
 from neuido.data.formats.gaussian_ply import read_gaussian_vertices
 from neuido.data.scenes.filmed_scene import load_views
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 
 CASES = Path(os.environ.get("NEUIDO_DATA", "")) / "cases"
@@ -35,7 +35,7 @@ def test_pincushion_without_a_mask():
 
 @pytest.mark.parametrize(("number", "focal"), [(4, (110.0, 150.0)), (8, (110.0, None)), (9, (110.0, 110.0)), (10, (110.0, 110.0))])
 def test_cameras(number, focal):
-    found = read(case(number))
+    found = read_recording(case(number))
     assert len(found.views) == 3 and len(found.times) == 1
     for i, value in enumerate(focal):
         assert value is None or torch.allclose(found.cameras.Ks[:, i, i], torch.tensor(value), atol=1e-3)
@@ -44,7 +44,7 @@ def test_cameras(number, focal):
 @pytest.mark.parametrize(("number", "match"), [(5, "is_fisheye"), (6, "k4 = 0.3"), (7, "write it row by row"), (12, "frame_interval")])
 def test_refused_by_name(number, match):
     with pytest.raises(UserError, match=match):
-        read(case(number))
+        read_recording(case(number))
 
 
 @pytest.mark.parametrize(("number", "count"), [(13, 5), (14, 4), (15, 4)])
@@ -61,7 +61,7 @@ def test_compressed_gaussians():
 def test_thirty_frames_a_second_divide_into_steps():
     from neuido.models.inference.prepared_scene import fitting_step, frame_substeps
 
-    times = read(case(11)).times
+    times = read_recording(case(11)).times
     dt = fitting_step(times, 5e-4)
     every, picks = frame_substeps(times, dt, "video")
     assert picks is None and dt <= 5e-4 and every * dt == pytest.approx(1 / 30)

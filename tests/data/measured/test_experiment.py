@@ -9,7 +9,7 @@ from neuido.data.bodies.scene_files import scene_from_dict
 from neuido.data.cameras import project
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, scene_to_dict, write_experiment
 from neuido.data.scenes.multiview import SceneViews
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator
@@ -97,7 +97,7 @@ def test_write_from_tensors(tmp_path):
     write_experiment(Experiment("made", tmp_path, scene, model, ("density",), (one, two)), tmp_path / "made")
     again = read_experiment(tmp_path / "made")
     assert again.scene == scene and again["b"].scene == two.scene and again["a"].noise == 0.0 and again.free == ("density",)
-    foreign = replace(one, video=read(samples.pacnerf(tmp_path / "pacnerf", S)))
+    foreign = replace(one, video=read_recording(samples.pacnerf(tmp_path / "pacnerf", S)))
     with pytest.raises(UserError, match=r"has no transforms\.json"):
         write_experiment(Experiment("made", tmp_path, scene, model, (), (foreign,)), tmp_path / "foreign")
     worse = replace(two, scene=replace(scene, cells=32))
@@ -310,7 +310,7 @@ def test_silicone_video(data_root):
 
 def test_silicone_video_camera_sees_the_body(data_root):
     """The particles at t = 0 fall on the mask of the first frame: the README gives an overlap of 0.95 with the free part."""
-    found = read(data_root / "measured" / "silicone-video")
+    found = read_recording(data_root / "measured" / "silicone-video")
     assert found.format == "experiment" and found.name == "silicone-video-swing"
     images, masks = SceneViews(found, width=256, frame_count=1).load([0])
     assert images.shape == (1, 1, 192, 256, 3)

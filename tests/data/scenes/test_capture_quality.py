@@ -13,7 +13,7 @@ from neuido.commands.check import check
 from neuido.data import cameras as convert
 from neuido.data.formats import nerfstudio
 from neuido.data.scenes.capture_quality import capture_findings
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 from neuido.types import Cameras
 from tests.command import run
@@ -79,7 +79,7 @@ def recording(
 
 
 def said(folder) -> list[tuple[str, bool, str]]:
-    return [tuple(each) for each in capture_findings(read(folder))]
+    return [tuple(each) for each in capture_findings(read_recording(folder))]
 
 
 def test_nothing_is_wrong_with_a_good_one(tmp_path, capsys):
@@ -115,7 +115,7 @@ def test_each_fault_is_found(tmp_path, options, check, wrong, words):
 def test_views_that_disagree_and_backgrounds_that_are_not_plain(tmp_path):
     folder = recording(tmp_path / "a")
     text = (folder / "transforms.json").read_text()
-    found = read(folder)
+    found = read_recording(folder)
     wrong = found.cameras.viewmats.clone()
     wrong[1, 0, 3] += 0.15
     nerfstudio.write_transforms(folder, found.cameras._replace(viewmats=wrong), found.times)

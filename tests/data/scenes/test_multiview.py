@@ -7,7 +7,7 @@ from lightning.pytorch import LightningModule, Trainer
 from neuido.data.cameras import project
 from neuido.data.formats import nerfstudio
 from neuido.data.scenes.multiview import MultiViewDataModule, MultiViewDataset, SceneViews
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
 from neuido.types import Cameras, MultiViewBatch
 from tests.data import samples
@@ -18,7 +18,7 @@ TRUTH = S.images / 255
 
 @pytest.fixture
 def found(tmp_path):
-    return read(samples.nerfstudio(tmp_path / "a", S))
+    return read_recording(samples.nerfstudio(tmp_path / "a", S))
 
 
 def composed(background: float) -> np.ndarray:
@@ -40,7 +40,7 @@ def test_half_transparent_pixels_are_not_premultiplied_in_files(tmp_path):
     rgba = np.full((samples.HEIGHT, samples.WIDTH, 4), [200, 100, 50, 51], np.uint8)
     samples.nerfstudio(tmp_path, one)
     samples.png(tmp_path / "images" / "0_000.png", rgba)
-    images, masks = SceneViews(read(tmp_path), background="white").load([0], [0])
+    images, masks = SceneViews(read_recording(tmp_path), background="white").load([0], [0])
     np.testing.assert_allclose(images[0, 0, 3, 3], 0.2 * np.array([200, 100, 50]) / 255 + 0.8, atol=0.5 / 255 + 1e-6)
     assert float(masks[0, 0, 3, 3]) == pytest.approx(0.2)
 
@@ -91,7 +91,7 @@ def test_images_are_read_when_wanted(found, monkeypatch):
 
 
 def test_mask_from_the_empty_scene(tmp_path):
-    images, masks = SceneViews(read(samples.pacnerf(tmp_path, S)), background="black").load(range(3))
+    images, masks = SceneViews(read_recording(samples.pacnerf(tmp_path, S)), background="black").load(range(3))
     truth = TRUTH[..., 3]
     both, either = (masks.numpy() * truth).sum(), np.maximum(masks.numpy(), truth).sum()
     assert both / either > 0.9  # a rough mask, on a blob of some 70 pixels
@@ -114,7 +114,7 @@ def test_undistortion(tmp_path):
     file = tmp_path / "transforms.json"
     keys = ", ".join(f'"{key}": {value}' for key, value in zip(("k1", "k2", "p1", "p2", "k3"), lens))
     file.write_text(file.read_text().replace('"camera_model"', keys + ', "camera_model"', 1))
-    out = SceneViews(read(tmp_path), background="black").load([0])[0][0, 0, ..., 0].numpy()
+    out = SceneViews(read_recording(tmp_path), background="black").load([0])[0][0, 0, ..., 0].numpy()
     for x, y in ideal:
         window = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 40) * out
         centre = np.array([(window * columns).sum(), (window * rows).sum()]) / window.sum()
@@ -148,11 +148,11 @@ def test_a_view_with_a_hole(tmp_path):
     file = folder / "transforms.json"
     file.write_text(file.read_text().replace('"time": 0.02, "view": 1', '"time": 0.03, "view": 1'))
     with pytest.raises(UserError, match=r"view 0 has no image at 0\.03 s"):
-        SceneViews(read(folder))
+        SceneViews(read_recording(folder))
 
 
 def test_dataset_parts(tmp_path):
-    scene = SceneViews(read(samples.blender(tmp_path, S)))
+    scene = SceneViews(read_recording(samples.blender(tmp_path, S)))
     sizes = {part: len(MultiViewDataset([scene], part)[0].images) for part in ("train", "held_out", "all")}
     assert sizes == {"train": 2, "held_out": 1, "all": 3}
     batch = MultiViewDataset([scene], "all", first=5)[0]
@@ -160,7 +160,7 @@ def test_dataset_parts(tmp_path):
     held_out = MultiViewDataset([scene], "held_out")[0]
     np.testing.assert_allclose(held_out.images, composed(1.0)[2:], atol=1e-6)
     np.testing.assert_allclose(held_out.cameras.viewmats, S.w2c[2:], atol=1e-6)
-    whole = SceneViews(read(samples.nerfstudio(tmp_path / "b", S)))
+    whole = SceneViews(read_recording(samples.nerfstudio(tmp_path / "b", S)))
     assert len(MultiViewDataset([whole], "held_out")[0].images) == 3
 
 

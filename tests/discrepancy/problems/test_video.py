@@ -18,7 +18,7 @@ from neuido.discrepancy.problems import silhouettes
 from neuido.discrepancy.problems.filmed import Splats, looks, read_film
 from neuido.discrepancy.problems.silhouettes import View
 from neuido.discrepancy.problems.video import VideoProblem, video_problem
-from neuido.models.render.gaussians import harmonics_of, save_ply
+from neuido.models.render.gaussians import harmonics_of, save_gaussians
 from neuido.types import Gaussians, ParticleState
 from tests import command
 from tests.discrepancy import made
@@ -199,7 +199,7 @@ def test_gaussians_of_the_folder_are_what_is_drawn(folders, tmp_path):
         dense = surround_with_gaussians(r.body, 27, seed="splats")
         means, covariances = dense.at(r.body.x[None], torch.eye(3).expand(1, len(r.body.x), 3, 3))
         opacity = torch.full((means.shape[1],), 0.9)
-        save_ply(folder / r.name / "gaussians.ply", Gaussians(means[0], covariances[0], opacity, harmonics_of(dense.colour)))
+        save_gaussians(folder / r.name / "gaussians.ply", Gaussians(means[0], covariances[0], opacity, harmonics_of(dense.colour)))
     problem = problem_of(folder)
     assert all(isinstance(f.look, Splats) for f in problem.footage)
     (truth,) = problem.predict([{"young": 6e4, **EFFECTS}], 0)

@@ -14,7 +14,7 @@ from neuido.data.files.score_tables import folder_of
 from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
 from neuido.models.inference.law_file import load_law, save_law
-from neuido.models.inference.outputs import write_plys
+from neuido.models.inference.outputs import write_particles
 from neuido.models.inference.pipeline import carry_points, infer_latent, render_motion, rollout_latent
 from neuido.models.inference.prepared_scene import prepare
 from neuido.models.inference.transfer import read_conditions, simulate_condition
@@ -167,8 +167,8 @@ def test_names_stay_inside(tmp_path):
 def test_a_shorter_sequence_replaces_a_longer_one(tools, tmp_path):
     operator, _, (prepared, _) = tools
     with torch.no_grad():
-        write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly")))
-        write_plys(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly"), 3))
+        write_particles(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly")))
+        write_particles(tmp_path, rollout_latent(prepared, operator, operator.latent("jelly"), 3))
     assert sorted(path.name for path in tmp_path.glob("*.ply")) == ["000.ply", "001.ply", "002.ply"]
 
 

@@ -21,7 +21,7 @@ from neuido.data.scenes.masks import masks_from_background
 from neuido.data.scenes.synthetic import make_scenes
 from neuido.errors import UserError
 from neuido.models.reconstruct.gaussian_fit import ReconstructModule
-from neuido.models.render.gaussians import bind, load_ply
+from neuido.models.render.gaussians import bind, load_gaussians
 from neuido.models.render.splatting import rasterize
 from neuido.models.scoring.metrics import chamfer_distance
 from neuido.physics.laws.classical import material
@@ -76,7 +76,7 @@ def test_files_are_what_stage_two_reads(box):
     # the velocity that is known: that of the true body's motion
     v = torch.tensor([0.2, -1.5, 0.0]) + torch.linalg.cross(torch.tensor([[0.0, 0.0, 2.0]]), visual.body.x - truth.x0.mean(0))
     torch.testing.assert_close(visual.body.v, v, rtol=0, atol=1e-4)
-    gaussians = load_ply(visual.gaussians, device="cpu")
+    gaussians = load_gaussians(visual.gaussians, device="cpu")
     binding = bind(gaussians, visual.body.x)
     assert float((binding.rest - gaussians.means).norm(dim=1).max()) < 0.1
     # it moves as the truth does, under the true law

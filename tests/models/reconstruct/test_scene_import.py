@@ -10,7 +10,7 @@ from neuido.data.bodies.scene_files import load_scene
 from neuido.data.neighbours import poses
 from neuido.errors import UserError
 from neuido.models.reconstruct.scene_import import import_scene
-from neuido.models.render.gaussians import save_ply
+from neuido.models.render.gaussians import save_gaussians
 from neuido.types import Gaussians
 from tests.command import run
 
@@ -34,7 +34,7 @@ def ball(tmp_path):
     means = torch.cat([directions + 5, faint, far])
     opacities = torch.cat([torch.full((3000,), 0.9), torch.full((200,), 0.01), torch.full((20,), 0.9)])
     covariances = (0.07**2 * torch.eye(3)).expand(len(means), 3, 3)
-    save_ply(tmp_path / "ball.ply", Gaussians(means, covariances, opacities, torch.zeros(len(means), 1, 3)))
+    save_gaussians(tmp_path / "ball.ply", Gaussians(means, covariances, opacities, torch.zeros(len(means), 1, 3)))
     return tmp_path / "ball.ply"
 
 

@@ -16,8 +16,8 @@ from neuido.models.render.gaussians import (
     degree_of,
     harmonic_basis,
     harmonics_of,
-    load_ply,
-    save_ply,
+    load_gaussians,
+    save_gaussians,
     scales_and_quaternions,
 )
 from neuido.types import Gaussians
@@ -70,8 +70,8 @@ def test_colours_are_shifted_and_not_negative():
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_ply_round_trip(degree, tmp_path):
     before = gaussians(degree=degree)
-    save_ply(tmp_path / "a.ply", before)
-    after = load_ply(tmp_path / "a.ply", dtype=torch.float64, device="cpu")
+    save_gaussians(tmp_path / "a.ply", before)
+    after = load_gaussians(tmp_path / "a.ply", dtype=torch.float64, device="cpu")
     assert degree_of(after.harmonics) == degree
     for name in ("means", "covariances", "opacities", "harmonics"):
         a, b = getattr(after, name), getattr(before, name)
@@ -84,7 +84,7 @@ def test_ply_is_read_as_3dgs_writes_it(tmp_path):
     names += ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     values = [1, 2, 3, 0, 0, 0, 0.1, 0.2, 0.3, 11, 12, 13, 21, 22, 23, 31, 32, 33, math.log(3.0), *np.log([0.1, 0.2, 0.4]), 2, 0, 0, 2]
     write_ply(tmp_path / "b.ply", np.array([tuple(values)], [(n, "f4") for n in names]))
-    read = load_ply(tmp_path / "b.ply", device="cpu")
+    read = load_gaussians(tmp_path / "b.ply", device="cpu")
     assert read.means.tolist() == [[1, 2, 3]]
     assert read.opacities.item() == pytest.approx(0.75)
     assert torch.allclose(read.harmonics[0], torch.tensor([[0.1, 0.2, 0.3], [11, 21, 31], [12, 22, 32], [13, 23, 33]]))
@@ -93,19 +93,19 @@ def test_ply_is_read_as_3dgs_writes_it(tmp_path):
 
 def test_ply_errors_name_the_file_and_what_it_lacks(tmp_path):
     with pytest.raises(UserError, match=r"the PLY file .*none\.ply is missing"):
-        load_ply(tmp_path / "none.ply")
+        load_gaussians(tmp_path / "none.ply")
     (tmp_path / "text.ply").write_text("hello")
     with pytest.raises(UserError, match=r"text\.ply is not a PLY file"):
-        load_ply(tmp_path / "text.ply")
+        load_gaussians(tmp_path / "text.ply")
     vertices = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     write_ply(tmp_path / "points.ply", vertices)
     with pytest.raises(UserError, match="not a 3DGS file: its vertices lack the columns f_dc_0"):
-        load_ply(tmp_path / "points.ply")
+        load_gaussians(tmp_path / "points.ply")
     with pytest.raises(UserError, match="holds one frame"):
         one = gaussians()
-        save_ply(tmp_path / "c.ply", one._replace(means=one.means.expand(2, -1, -1)))
+        save_gaussians(tmp_path / "c.ply", one._replace(means=one.means.expand(2, -1, -1)))
     with pytest.raises(UserError, match="cannot hold rotated harmonics"):
-        save_ply(tmp_path / "c.ply", one._replace(rotations=torch.eye(3).expand(7, 3, 3)))
+        save_gaussians(tmp_path / "c.ply", one._replace(rotations=torch.eye(3).expand(7, 3, 3)))
 
 
 def test_scales_and_quaternions_rebuild_the_covariance():
