@@ -9,7 +9,7 @@ import torch
 from neuido.data import cameras as convert
 from neuido.data.formats import nerfstudio
 from neuido.data.scenes.multiview import SceneViews
-from neuido.data.scenes.readers import read
+from neuido.data.scenes.readers import read_recording
 from neuido.data.scenes.view_geometry import mean_misfit, triangulate, view_delays
 from neuido.errors import UserError
 from neuido.types import Cameras
@@ -28,7 +28,7 @@ def turning(views: int = 3, step: float = 9.0) -> Cameras:
 def recorded(folder, views: int = 3):
     times = torch.arange(FRAMES, dtype=torch.float64) * 0.1
     nerfstudio.write(folder, turning(views), times, S.images[:views])
-    return read(folder)
+    return read_recording(folder)
 
 
 def edit(folder, change) -> None:
@@ -57,16 +57,16 @@ def test_written_poses_are_read_and_placed(tmp_path):
 def test_fixed_cameras_have_one_pose(tmp_path):
     cameras = turning().at(0)
     nerfstudio.write(tmp_path, cameras, torch.arange(FRAMES, dtype=torch.float64), S.images)
-    found = read(tmp_path)
+    found = read_recording(tmp_path)
     assert not found.cameras.moving and found.cameras.at(2) is found.cameras
     edit(tmp_path, lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(3, c["frames"][1]["transform_matrix"][0][3] + 1e-7))
-    assert not read(tmp_path).cameras.moving
+    assert not read_recording(tmp_path).cameras.moving
 
 
 def test_one_video_and_folders_of_videos_without_views(tmp_path):
     recorded(tmp_path / "one", views=1)
     edit(tmp_path / "one", lambda c: [frame.pop("view") for frame in c["frames"]])
-    found = read(tmp_path / "one")
+    found = read_recording(tmp_path / "one")
     assert found.views == ("0",) and found.cameras.viewmats.shape == (1, FRAMES, 4, 4) and None not in found.images[0]
 
     recorded(tmp_path / "two", views=2)
@@ -80,10 +80,10 @@ def test_one_video_and_folders_of_videos_without_views(tmp_path):
             frame["file_path"] = name
 
     edit(folder, apart)
-    found = read(folder)
+    found = read_recording(folder)
     assert found.views == ("0", "1") and found.cameras.moving and found.images[1][2].parent.name == "1"
     edit(folder, lambda c: c.update(test_filenames=[f["file_path"] for f in c["frames"][FRAMES:]]))
-    assert read(folder).held_out == (1,)
+    assert read_recording(folder).held_out == (1,)
 
 
 def test_colmap_images_of_videos(tmp_path):
@@ -99,14 +99,14 @@ def test_colmap_images_of_videos(tmp_path):
         nerfstudio.write_image(tmp_path / "images" / name, S.images[0][t])
     lines = "".join(f"{t + 1} {row} 1 {name}\n\n" for t, (row, name) in enumerate(zip(rows, names)))
     (tmp_path / "sparse/0/images.txt").write_text(lines)
-    assert len(read(tmp_path).views) == 4 and not read(tmp_path).cameras.moving
-    found = read(tmp_path, frame_interval=0.5)
+    assert len(read_recording(tmp_path).views) == 4 and not read_recording(tmp_path).cameras.moving
+    found = read_recording(tmp_path, frame_interval=0.5)
     assert found.views == ("1",) and found.times.tolist() == [0.0, 0.5, 1.5, 2.0]
     torch.testing.assert_close(found.cameras.viewmats[0], cameras.viewmats[0], atol=1e-5, rtol=0)
     (tmp_path / "sparse/0/images.txt").write_text(lines.replace("frame_0008", "frame"))
     (tmp_path / "images/frame_0008.png").rename(tmp_path / "images/frame.png")
     with pytest.raises(UserError, match=r"frame\.png has no number in its name"):
-        read(tmp_path, frame_interval=0.5)
+        read_recording(tmp_path, frame_interval=0.5)
 
 
 def test_rays_of_turning_cameras_meet_where_those_of_fixed_ones_do():
@@ -137,14 +137,14 @@ def test_what_is_wrong_is_one_line(tmp_path, change, message):
     recorded(tmp_path)
     edit(tmp_path, change)
     with pytest.raises(UserError, match=message):
-        read(tmp_path)
+        read_recording(tmp_path)
 
 
 def test_times_that_do_not_match(tmp_path):
     recorded(tmp_path)
     edit(tmp_path, lambda c: [frame.update(time=frame["time"] + 0.05) for frame in c["frames"][:FRAMES]])
     with pytest.raises(UserError, match=r"view 1 has no image at 0\.05 s|view 0 has no image at 0 s"):
-        SceneViews(read(tmp_path))
+        SceneViews(read_recording(tmp_path))
 
 
 def test_stages_that_need_fixed_cameras_say_so(tmp_path):
