@@ -11,29 +11,25 @@ import torch
 import yaml
 
 from neuido.data.files.writing import write_text
-from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth_entry
-from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4, scale_to_separation
+from neuido.data.undeclared.curve_files import Sizes, drawn_effect, key_rows, write_csv, write_tests
+from neuido.data.undeclared.laboratory_tests import form_of
+from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, truth_entry
+from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.effects.point_library import FLUID
 from neuido.physics.laws.classical import material
-from neuido.physics.points.flow_curve import flow_stress
 from neuido.physics.points.material_point import Specimen, stress_along
 from neuido.physics.points.point_mass import Forces, fly
 from neuido.types import Vector
 
-Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
 TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "second_invariant", "tension_compression", "yield",
               "hardening", "kinematic_hardening", "rate_yield", "softening", "stiffness_change", "relaxation_spectrum", "fractional",
               "mullins", "permanent_set", "nonlinear_backstress", "cyclic_hardening", "rate_power", "power_law", "carreau", "bingham",
-              "herschel_bulkley")  # fmt: skip
+              "herschel_bulkley", "thixotropy", "creep", "compaction")  # fmt: skip
 YIELDING = ("hardening", "kinematic_hardening", "rate_yield", "nonlinear_backstress", "cyclic_hardening", "rate_power")
 """Effects of a body that is declared as one that yields."""
-RELATIVE = 0.01
-"""Noise of a flow curve, relative to the stress."""
 TRACK_KINDS = ("gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force")
 PERIOD = 2.0
 """Period of the loading of a specimen [s]."""
@@ -61,37 +57,10 @@ def curve_case(
     return (_test if case.measured == "material_test" else _track)(rng, kind, ratio, name, advance)
 
 
-def _effect(
-    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
-) -> Drawn | None:
-    if kind == "none":
-        return None
-    values, names, smallest, largest = sizes[kind]
-    drawn = Drawn(
-        kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), smallest, largest
-    )
-    found = scale_to_separation(drawn, target, lambda one: separation(one.values), 16.0 * noise)
-    return found.rounded()
-
-
-def _rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: list[str], names: list[str], unit: str) -> list[dict]:
-    rows = []
-    for x, y, role, name in zip(true, plain, roles, names):
-        separation = rms(x - y)
-        rows.append(
-            {
-                "name": name,
-                "role": role,
-                f"separation_rms_{unit}": rounded_to_4(separation),
-                "separation_over_noise": rounded_to_4(separation / noise),
-            }
-        )
-    return rows
-
-
 def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
-    if kind in FLUID:
-        return _fluid(rng, kind, ratio, name, advance)
+    form = form_of(rng, kind)
+    if form is not None:
+        return form(rng, kind, ratio, name, advance)
     plastic = PLASTIC if kind in YIELDING else ELASTIC
     if kind == "none" and rng.random() < 0.3:
         plastic = PLASTIC
@@ -103,11 +72,18 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         reach = rng.uniform(0.06, 0.1)
         plasticity["yield_stress"] = float(f"{young * rng.uniform(0.015, 0.025):.3g}")
     paths, n = [], 160
-    plans = (("slow", "uniaxial", "fit", 1.0, 1.0), ("flat", "equibiaxial", "fit", 0.6, 0.7), ("fast", "uniaxial", "held_out", 1.15, 0.4))
+    plans: tuple = (
+        ("slow", "uniaxial", "fit", 1.0, 1.0),
+        ("flat", "equibiaxial", "fit", 0.6, 0.7),
+        ("fast", "uniaxial", "held_out", 1.15, 0.4),
+    )
+    if kind == "compaction":  # it shows in large compression alone
+        reach = rng.uniform(0.7, 0.9)
+        plans = (("once", "uniaxial", "fit", 1.0, 1.0), ("deeper", "uniaxial", "held_out", 1.1, 1.0))
     for _, _, _, amount, period in plans:
         t = np.linspace(0.0, 2.25 * period * PERIOD, n)
         swing = np.sin(2 * np.pi * t / (period * PERIOD)) * (0.55 + 0.45 * t / t[-1])
-        paths.append((t, np.exp(reach * amount * swing)))
+        paths.append((t, np.exp(-reach * amount * swing**2 if kind == "compaction" else reach * amount * swing)))
 
     def stresses(values: Mapping[str, float]) -> list[np.ndarray]:
         specimen = Specimen(*material(elasticity, plasticity), Effects.of(dict(values)), 1)
@@ -124,7 +100,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     noise = 3e-3 * max(float(np.abs(one).max()) for one in plain)
     flow = plasticity.get("yield_stress", young)
     sizes = _test_sizes(rng, young, flow)
-    drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
+    drawn = drawn_effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
     true = stresses(drawn.values) if drawn else plain
     declared = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
     free = ["young", "yield_stress"] if plastic == PLASTIC and rng.random() < 0.5 else ["young"]
@@ -138,7 +114,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         "started_from": start,
         "simulated_with": "the law along the path",
         "noise": rounded_to_4(noise),
-        "tests": _rows(true, plain, noise, roles, names, "pa") if drawn else [],
+        "tests": key_rows(true, plain, noise, roles, names, "pa") if drawn else [],
     }  # fmt: skip
     tests = []
     for (title, mode, role, *_), (t, path), stress in zip(plans, paths, true):
@@ -150,7 +126,7 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         "plasticity": {k: start.get(k, v) for k, v in plasticity.items()},
         "free": free,
     }
-    return functools.partial(_write_tests, name, model, tests), truth
+    return functools.partial(write_tests, name, model, tests), truth
 
 
 def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
@@ -175,59 +151,13 @@ def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
         ),
         "fractional": ({"ratio": 0.2, "exponent": rng.uniform(0.15, 0.5), "time": 0.2 * PERIOD}, "ratio", 0.05, 20),
         "mullins": ({"share": 0.1, "width": rng.uniform(0.2, 1.0)}, "share", 0.05, 8),
+        "compaction": ({"k": 0.3, "lock": rng.uniform(1.2, 1.6)}, "k", 0.02, 20),
         "permanent_set": ({"share": 0.05}, "share", 0.05, 10),
         "nonlinear_backstress": ({"h1": 0.3 * young, "g1": 15.0}, "h1", 0.02, 20),
         "cyclic_hardening": ({"q": (-0.2 if rng.random() < 0.5 else 0.3) * flow, "b": 5.0}, "q", 0.02, 3),
         "rate_power": ({"k": 0.2 * flow, "n": rng.uniform(0.2, 0.6)}, "k", 0.02, 20),
         "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
     }
-
-
-def _fluid(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
-    """Draw flow curves of a fluid: one is fitted, and one at other rates is held out."""
-    viscosity = float(f"{math.exp(rng.uniform(math.log(0.1), math.log(100.0))):.3g}")
-    rates = [np.geomspace(0.02, 50.0, 40), np.geomspace(0.05, 120.0, 30)]
-    least = viscosity * 0.02
-    sizes: Sizes = {
-        "power_law": ({"n": -0.3, "reference": 1.0}, "n", 0.05, 2),
-        "carreau": ({"n": -0.4, "time": rng.uniform(0.3, 3.0)}, "n", 0.05, 2),
-        "bingham": ({"yield": 5 * least}, "yield", 0.01, 100),
-        "herschel_bulkley": ({"yield": 10 * least, "n": -rng.uniform(0.3, 0.6), "reference": 1.0}, "yield", 0.01, 100),
-    }
-
-    def stresses(values: Mapping[str, float]) -> list[np.ndarray]:
-        advance(1)
-        given = {key: np.array([value]) for key, value in values.items()}
-        return [np.log(flow_stress(np.array([viscosity]), given, rate)[0]) for rate in rates]
-
-    plain = stresses({})
-    drawn = _effect(rng, kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(stresses(values)[0] - plain[0]))
-    true = stresses(drawn.values) if drawn else plain
-    names, roles = ["curve", "again"], ["fit", "held_out"]
-    truth = {
-        "undeclared": [truth_entry(drawn, free=("viscosity",))] if drawn else [],
-        "measured": "material_test",
-        "material": {"flow": "newtonian", "viscosity": viscosity},
-        "simulated_with": "the flow curve",
-        "noise": RELATIVE,
-        "tests": _rows(true, plain, RELATIVE, roles, names, "1") if drawn else [],
-    }
-    rows = [np.stack([rate, np.exp(y + RELATIVE * rng.normal(size=len(y)))], axis=1) for rate, y in zip(rates, true, strict=True)]
-    declared = float(f"{viscosity * rng.uniform(0.5, 2.0):.3g}")
-    model = {"density": 1000.0, "flow": {"law": "newtonian", "viscosity": declared}, "free": ["viscosity"]}
-    columns = {"shear_rate": "rate_per_s", "shear_stress": "stress_pa"}
-    tests = [(n, "flow_curve", role, columns, own) for n, role, own in zip(names, roles, rows, strict=True)]
-    return functools.partial(_write_tests, name, model, tests), truth
-
-
-def _write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple[str, str, str, dict, np.ndarray]], folder: Path) -> None:
-    entries = []
-    for title, mode, role, columns, rows in tests:
-        _write_csv(folder / f"{title}.csv", tuple(columns.values()), rows)
-        entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": dict(columns), "role": role})
-    content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": entries}
-    write_text(folder / "test.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-    read_material_tests(folder)
 
 
 def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
@@ -256,7 +186,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
 
     plain = paths({})
     sizes = _track_sizes(rng)
-    drawn = _effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
+    drawn = drawn_effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
     true = paths(drawn.values) if drawn else plain
     roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
     truth = {
@@ -264,7 +194,7 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
         "measured": "track",
         "simulated_with": "a point mass, Runge-Kutta steps of 2 ms",
         "noise": noise,
-        "recordings": _rows(list(true), list(plain), noise, roles, names, "m") if drawn else [],
+        "recordings": key_rows(list(true), list(plain), noise, roles, names, "m") if drawn else [],
     }
     seen = true + noise * rng.normal(size=true.shape)
     rows = [(title, role, np.concatenate([t[:, None], x], axis=1)) for title, role, x in zip(names, roles, seen)]
@@ -291,7 +221,7 @@ def _track_sizes(rng: np.random.Generator) -> Sizes:
 def _write_tracks(name: str, gravity: Vector, noise: float, tracks: Sequence[tuple[str, str, np.ndarray]], folder: Path) -> None:
     entries = []
     for title, role, rows in tracks:
-        _write_csv(folder / f"{title}.csv", ("t_s", "x_m", "y_m", "z_m"), rows)
+        write_csv(folder / f"{title}.csv", ("t_s", "x_m", "y_m", "z_m"), rows)
         columns = {"t": "t_s", "x": "x_m", "y": "y_m", "z": "z_m"}
         entries.append({"name": title, "body": "ball", "file": f"{title}.csv", "columns": columns, "noise": noise, "role": role})
     content = {
@@ -300,8 +230,3 @@ def _write_tracks(name: str, gravity: Vector, noise: float, tracks: Sequence[tup
     }  # fmt: skip
     write_text(folder / "track.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     read_tracks(folder)
-
-
-def _write_csv(path: Path, titles: tuple[str, ...], rows: np.ndarray) -> None:
-    lines = (titles, *([f"{value:.7g}" for value in row] for row in rows))
-    write_text(path, "".join(f"{','.join(line)}\r\n" for line in lines))

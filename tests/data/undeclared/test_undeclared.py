@@ -258,11 +258,26 @@ def test_density_gradient_turns_a_thrown_body_about_another_centre():
 # Curves.
 
 
+def test_kinds_of_test(tmp_path):
+    """A relaxation may be shown by an oscillation, and a creep test prescribes the stress."""
+    modes = set()
+    for seed in range(6):
+        make_undeclared(
+            seed, str(tmp_path / f"{seed}"), case=Case(measured="material_test", kind="fractional"), device="cpu", progress=False
+        )
+        test = yaml.safe_load((tmp_path / f"{seed}" / "test.yaml").read_text())["tests"][0]
+        modes.add(test.get("control") or ("oscillation" if test["mode"] == "oscillation" else "path"))
+    assert modes == {"stress", "oscillation", "path"}
+
+
 @pytest.mark.parametrize(
     ("measured", "kind", "read"),
     [
         ("material_test", "mullins", read_material_tests),
         ("material_test", "herschel_bulkley", read_material_tests),
+        ("material_test", "thixotropy", read_material_tests),
+        ("material_test", "creep", read_material_tests),
+        ("material_test", "compaction", read_material_tests),
         ("material_test", "second_invariant", read_material_tests),
         ("track", "magnus", read_tracks),
         ("guided", "spring:dry_friction", read_tracks),

@@ -208,7 +208,7 @@ def _timed(c: _Collection, fits: Sequence[MaterialTest], strains: Sequence[np.nd
           ("ratio", 0.2, 0.0, 20.0), ("time", 0.5, 0.1 * shortest, 20 * duration), sizes="ratio", log="time")  # fmt: skip
     c.add("hysteresis", [{"eta": 0.1}], ("eta", 0.05, 0.0, 1.0))
     if duration > 30 * shortest:
-        most = 1e4 if not paths else 50.0
+        most = 1e4 if not paths or any(test.control == "stress" for test in paths) else 50.0  # a melt relaxes all but a trace
         names = [f"g{i}" for i in range(1, 6)]
         fixed = {"first": shortest, "last": duration}
         if paths:
@@ -222,12 +222,37 @@ def _timed(c: _Collection, fits: Sequence[MaterialTest], strains: Sequence[np.nd
               sizes="ratio", log="exponent", fixed={"time": float(np.sqrt(shortest * duration))})  # fmt: skip
     if tests.model["plasticity"]["law"] == "identity":
         norm = max(stress * np.sqrt(2 / 3), 1e-6)
-        rate = 0.3 * norm / (2 * mu) / duration
+        rate = norm / (2 * mu) / duration
         exponents = (1.0,) if not paths else (1.0, 3.0)
+        crept = _crept(paths, float(tests.model["elasticity"]["poisson"]))
+        rates, beside = (0.3 * rate, 9.0 * rate), ({},)
+        if crept is not None:
+            rates, beside = (crept[1],), ({}, {"young": crept[0]}) if "young" in tests.free else ({},)
         shape = () if not paths else (("exponent", 0.3, 0.5, 15.0),)
-        c.add("creep", [{"rate": f * rate, "exponent": n} for n in exponents for f in (1.0, 30.0)],
-              ("rate", 0.5, 1e-4 * rate, 1e5 * rate), *shape, sizes="rate", log="rate exponent", linear=False,
-              fixed={"stress": float(norm)} | ({"exponent": 1.0} if not paths else {}))  # fmt: skip
+        typical = 0.3 * rate if crept is None else crept[1]
+        c.add("creep", [{"rate": r, "exponent": n} for n in exponents for r in rates],
+              ("rate", 0.5, 1e-4 * typical, 1e5 * typical), *shape, sizes="rate", log="rate exponent", linear=False,
+              fixed={"stress": float(norm)} | ({"exponent": 1.0} if not paths else {}), beside=beside)  # fmt: skip
+
+
+def _crept(tests: Sequence[MaterialTest], poisson: float) -> tuple[float, float] | None:
+    """Return the modulus that a specimen shows at once under a prescribed stress [Pa], and its rate of flow at the end [1/s].
+
+    The rate is the norm of the plastic strain rate in the last fifth of the test. None where no test prescribes the stress.
+    """
+    found = []
+    for test in tests:
+        e, t = strain_of(test)[:, 0], test.time
+        if test.control != "stress" or t is None or e[0] * test.stress[0, 0] <= 0:
+            continue
+        shear = test.mode == "simple_shear"
+        late = t >= t[-1] - 0.2 * np.ptp(t)
+        if late.sum() < 3:
+            continue
+        slope = abs(float(np.polyfit(t[late], e[late], 1)[0]))
+        young = float(test.stress[0, 0] / e[0]) * (2 * (1 + poisson) if shear else 1.0)
+        found.append((young, max(slope * np.sqrt(0.5 if shear else 1.5), 1e-12)))
+    return (float(np.median([y for y, _ in found])), float(max(r for _, r in found))) if found else None
 
 
 def fluid_candidates(tests: MaterialTests) -> tuple[tuple[Candidate, ...], dict[str, float], dict[str, str]]:

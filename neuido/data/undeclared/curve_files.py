@@ -1,0 +1,63 @@
+"""What made material tests and tracks share: the size of an effect, the rows of the key, and the files of a folder."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from neuido.data.files.writing import write_text
+from neuido.data.measured.material_test import read_material_tests
+from neuido.data.undeclared.random_effects import Drawn
+from neuido.data.undeclared.sizing import rms, rounded_to_4, scale_to_separation
+
+Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
+"""For each effect: initial values, names of the parameters to scale, and the smallest and largest scale factor."""
+
+
+def drawn_effect(
+    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
+) -> Drawn | None:
+    """Return an effect that moves the data by about `target` times the noise; None for `none`."""
+    if kind == "none":
+        return None
+    values, names, smallest, largest = sizes[kind]
+    drawn = Drawn(
+        kind, {f"{kind}.{k}": float(v) for k, v in values.items()}, tuple(f"{kind}.{k}" for k in names.split()), smallest, largest
+    )
+    found = scale_to_separation(drawn, target, lambda one: separation(one.values), 16.0 * noise)
+    return found.rounded()
+
+
+def key_rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: list[str], names: list[str], unit: str) -> list[dict]:
+    """Return what the key says of each recording: how far the effect moves it."""
+    rows = []
+    for x, y, role, name in zip(true, plain, roles, names):
+        separation = rms(x - y)
+        rows.append(
+            {
+                "name": name,
+                "role": role,
+                f"separation_rms_{unit}": rounded_to_4(separation),
+                "separation_over_noise": rounded_to_4(separation / noise),
+            }
+        )
+    return rows
+
+
+def write_tests(name: str, model: Mapping[str, Any], tests: Sequence[tuple], folder: Path) -> None:
+    """Write a folder of material tests: (title, mode, role, columns, rows), and further keys of the test where there are any."""
+    entries = []
+    for title, mode, role, columns, rows, *more in tests:
+        write_csv(folder / f"{title}.csv", tuple(columns.values()), rows)
+        entries.append({"name": title, "file": f"{title}.csv", "mode": mode, "columns": dict(columns), "role": role} | dict(*more))
+    content = {"format": "neuido-material-test/1", "name": name, "model": dict(model), "tests": entries}
+    write_text(folder / "test.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    read_material_tests(folder)
+
+
+def write_csv(path: Path, titles: tuple[str, ...], rows: np.ndarray) -> None:
+    """Write a CSV file."""
+    lines = (titles, *([f"{value:.7g}" for value in row] for row in rows))
+    write_text(path, "".join(f"{','.join(line)}\r\n" for line in lines))
