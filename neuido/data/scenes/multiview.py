@@ -126,13 +126,15 @@ class SceneViews:
             UserError: A file is not an image, or has another aspect ratio than its camera.
         """
         frames = range(len(self.frames)) if frames is None else frames
-        shape = (len(views), len(frames), self.cameras.height, self.cameras.width, 4)
-        out = np.empty(shape, dtype=np.float32 if self.find_masks else np.uint8)
+        shape = (len(views), len(frames), self.cameras.height, self.cameras.width)
+        images, masks = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
         for i, v in enumerate(views):
             for k, t in enumerate(frames):
-                out[i, k] = self._image(self.chosen[v], self.frames[t])
-        rgba = torch.from_numpy(out).float().div_(255)
-        return rgba[..., :3].contiguous(), rgba[..., 3].contiguous()
+                rgba = self._image(self.chosen[v], self.frames[t])
+                rgb = rgba[..., :3] if rgba.dtype != np.uint8 else cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB)  # dense: divided faster
+                np.divide(rgb, np.float32(255), out=images[i, k])
+                np.divide(rgba[..., 3], np.float32(255), out=masks[i, k])
+        return torch.from_numpy(images), torch.from_numpy(masks)
 
     @cached_property
     def plain_background(self) -> np.ndarray | None:
@@ -162,11 +164,14 @@ class SceneViews:
             return self.plain_background
         return np.full(3, BACKGROUNDS[self.background], np.float32)
 
-    def _recorded(self, v: int, t: int) -> tuple[np.ndarray, bool]:
-        """Load an image as recorded, with its mask as alpha channel, (H, W, 4); return also whether its mask is known."""
+    def _recorded(self, v: int, t: int, raw: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
+        """Load an image as recorded, with its mask as alpha channel, (H, W, 4); return also whether its mask is known.
+
+        `raw` is the content of the file, if it was read before.
+        """
         found = self.found
         path, mask = found.images[v][t], found.masks[v][t] if found.masks else None
-        rgba = _read(path, found.cameras)
+        rgba = _read(path, found.cameras, raw=raw)
         if mask is not None:
             rgba[..., 3] = _read(mask, found.cameras, channel=True)
             return rgba, True
@@ -180,13 +185,46 @@ class SceneViews:
     def _image(self, v: int, t: int) -> np.ndarray:
         """Return RGB over the background, and the mask, (H, W, 4) in 0..255.
 
-        The array is uint8, or float32 with `find_masks`. A computed mask is not rounded to eight bits, because the rounding changes which
-        pixels of an outline count as the object.
+        The array is uint8, or float32 for a computed mask, which is not rounded to eight bits, because the rounding changes which pixels of
+        an outline count as the object.
         """
         if (v, t) in self._kept:
             return self._kept[v, t]
+        path = self.found.images[v][t]
+        raw = None if path is None else read_image(path)
+        done = None if raw is None else self._eight_bit(v, t, raw)
+        if done is None:
+            done = self._composed(v, t, raw)
+        if self.cache:
+            self._kept[v, t] = done
+        return done
+
+    def _eight_bit(self, v: int, t: int, raw: np.ndarray) -> np.ndarray | None:
+        """Return what `_composed` does, in a fifth of the time, of an image with a mask of its own that is neither resized nor undistorted.
+
+        Only the pixels of an outline need arithmetic. Returns None for other images.
+        """
+        found, size = self.found, (self.cameras.width, self.cameras.height)
+        other = found.distortion is not None or (found.masks and found.masks[v][t] is not None) or not self.masked
+        if other or size != (found.cameras.width, found.cameras.height) or raw.shape != (size[1], size[0], 4) or raw.dtype != np.uint8:
+            return None
+        alpha = raw[..., 3]
+        if int(alpha.min()) == 255:
+            return None
+        done = cv2.cvtColor(raw, cv2.COLOR_BGRA2RGBA)
+        behind = self.background_colour
+        empty = np.append(np.rint(255 * behind), 0).astype(np.uint8).view(np.uint32)  # a pixel as one number
+        np.copyto(done.view(np.uint32)[..., 0], empty[0], where=alpha == 0)
+        outline = np.flatnonzero((alpha > 0) & (alpha < 255))
+        part = done.reshape(-1, 4)[outline].astype(np.float32) / 255
+        colour = part[:, :3] * part[:, 3:] + behind * (1 - part[:, 3:])
+        done.reshape(-1, 4)[outline, :3] = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+        return done
+
+    def _composed(self, v: int, t: int, raw: np.ndarray | None) -> np.ndarray:
+        """Return RGB over the background, and the mask, (H, W, 4) in 0..255, of any image; `raw` is the content of its file."""
         found = self.found
-        rgba, masked = self._recorded(v, t)
+        rgba, masked = self._recorded(v, t, raw)
         if not masked and self.find_masks:
             colour = self.plain_background
             if colour is None:  # the first frames have masks, but this image has none
@@ -205,10 +243,7 @@ class SceneViews:
         done = 255 * np.clip(np.concatenate([image, layers[..., 3:4]], axis=2), 0, 1)
         rounded = slice(3) if self.find_masks and not masked else slice(4)
         done[..., rounded] = np.rint(done[..., rounded])
-        done = done.astype(np.float32 if self.find_masks else np.uint8)
-        if self.cache:
-            self._kept[v, t] = done
-        return done
+        return done.astype(np.float32 if self.find_masks else np.uint8)
 
 
 class MultiViewDataset(Dataset):
@@ -361,11 +396,14 @@ def _indices(found: MultiView, names: Sequence[Any], option: str) -> list[int]:
     return [found.views.index(name) for name in names]
 
 
-def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.ndarray:
-    """Load an image as RGBA (H, W, 4), or a mask (H, W) if `channel`, float32 in [0, 1], resized to the image size of the cameras."""
+def _read(path: Path | None, cameras: Cameras, *, channel: bool = False, raw: np.ndarray | None = None) -> np.ndarray:
+    """Load an image as RGBA (H, W, 4), or a mask (H, W) if `channel`, float32 in [0, 1], resized to the image size of the cameras.
+
+    `raw` is the content of the image file, if it was read before.
+    """
     if path is None:
         raise UserError("an image is missing")
-    image = mask_channel(path) if channel else _rgba(path)
+    image = mask_channel(path) if channel else _rgba(read_image(path) if raw is None else raw)
     height, width = image.shape[:2]
     if (width, height) != (cameras.width, cameras.height):
         if abs(width * cameras.height / (height * cameras.width) - 1) > SAME_SHAPE:
@@ -376,8 +414,7 @@ def _read(path: Path | None, cameras: Cameras, *, channel: bool = False) -> np.n
     return image
 
 
-def _rgba(path: Path) -> np.ndarray:
-    raw = read_image(path)
+def _rgba(raw: np.ndarray) -> np.ndarray:
     image = raw.astype(np.float32) / np.iinfo(raw.dtype).max
     if image.ndim == 2 or image.shape[2] == 1:
         return cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA)

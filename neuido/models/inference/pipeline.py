@@ -129,7 +129,7 @@ def carry_points(rest: Tensor, points: Tensor, x: Tensor, nearest: int = 8) -> T
     """
     from scipy.spatial import KDTree
 
-    distance, index = KDTree(rest.detach().cpu().numpy()).query(points.detach().cpu().numpy(), k=min(nearest, len(rest)))
+    distance, index = KDTree(rest.detach().cpu().numpy()).query(points.detach().cpu().numpy(), k=min(nearest, len(rest)), workers=-1)
     d = torch.as_tensor(distance, dtype=torch.float64).reshape(len(points), -1)
     weight = 1 / (d.square() + 1e-12)
     weight = (weight / weight.sum(1, keepdim=True)).to(x)

@@ -80,15 +80,16 @@ class PreparedScene(NamedTuple):
 
     def views(self, views: list[int]) -> Cameras:
         """Return the cameras of the given views."""
-        return self.cameras._replace(viewmats=self.cameras.viewmats[views], Ks=self.cameras.Ks[views])
+        viewmats, Ks = (torch.stack([t[v] for v in views]) for t in (self.cameras.viewmats, self.cameras.Ks))
+        return self.cameras._replace(viewmats=viewmats, Ks=Ks)
 
     def recorded(self, views: list[int], frames: int | None = None) -> Tensor:
         """Return the recorded images of the given views in [0, 1], (T, V, H, W, 3)."""
-        return self.images[views, :frames].transpose(0, 1).float().div_(255)
+        return torch.stack([self.images[v, :frames] for v in views], 1).float().div_(255)  # an index list would stop the host
 
     def silhouettes(self, views: list[int], frames: int | None = None) -> Tensor:
         """Return the recorded masks of the given views in [0, 1], (T, V, H, W)."""
-        return self.masks[views, :frames].transpose(0, 1).float().div_(255)
+        return torch.stack([self.masks[v, :frames] for v in views], 1).float().div_(255)
 
 
 def as_device(device: str | torch.device) -> torch.device:

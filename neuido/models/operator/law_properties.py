@@ -1,5 +1,6 @@
 """Properties of a learned law: its small-strain moduli, and a penalty on laws that a rollout would not survive."""
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -71,13 +72,24 @@ def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samp
         modulus: P-wave modulus [Pa], ().
         samples: Number of deformation gradients, a third each at small, medium and large strains.
     """
-    generator = torch.Generator().manual_seed(0)
-    spread = torch.tensor([0.03, 0.1, 0.2]).repeat_interleave(samples // 3)[:, None, None]
-    F = (torch.eye(3) + spread * torch.randn(3 * (samples // 3), 3, 3, generator=generator)).to(modulus)
-    F = F[torch.linalg.det(F) > 0.2]
+    F, strain = _probes(samples, modulus.dtype, modulus.device)
     tau = stress(F)
-    l, A, _ = hencky_strain(F)
-    strain = A + l[:, None, None] / 3 * torch.eye(3).to(modulus)
     work = (tau * strain).sum((1, 2)) / (tau.flatten(1).norm(dim=1) * strain.flatten(1).norm(dim=1) + 1e-6)
     stiff = tau.flatten(1).norm(dim=1) / (3 * modulus.clamp(min=1e3) * strain.flatten(1).norm(dim=1))
     return (0.1 - work).relu().mean() + stiff.clamp(min=1).log().square().mean()
+
+
+@functools.lru_cache(maxsize=8)
+def _probes(samples: int, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the deformation gradients of `implausible_stress` and their strains, (n, 3, 3) each.
+
+    They are constants: made for each call, they would stop the host until the device is idle.
+    """
+    generator = torch.Generator().manual_seed(0)
+    spread = torch.tensor([0.03, 0.1, 0.2]).repeat_interleave(samples // 3)[:, None, None]
+    with torch.inference_mode(False), torch.no_grad():
+        F = (torch.eye(3) + spread * torch.randn(3 * (samples // 3), 3, 3, generator=generator)).to(dtype)
+        F = F[torch.linalg.det(F) > 0.2]
+        l, A, _ = hencky_strain(F)
+        strain = A + l[:, None, None] / 3 * torch.eye(3, dtype=dtype)
+    return F.to(device), strain.to(device)

@@ -128,7 +128,7 @@ def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = R
     means, covariances = gaussians.means.detach().double().cpu(), gaussians.covariances.detach().double().cpu()
     points = x.detach().double().cpu()
     many = min(4 * nearest, len(points))
-    _, index = KDTree(points.numpy()).query(means.numpy(), k=many)
+    _, index = KDTree(points.numpy()).query(means.numpy(), k=many, workers=-1)
     index = torch.as_tensor(np.asarray(index).reshape(len(means), many))
     d = points[index] - means[:, None]
     small = 1e-12 * covariances.diagonal(dim1=-2, dim2=-1).sum(-1).clamp(min=1e-30)

@@ -9,6 +9,7 @@ from typing import Any, cast
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
+from torch.nn import functional
 
 from neuido.data.files.score_tables import write_rows
 from neuido.errors import UserError
@@ -73,11 +74,11 @@ def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int
     images, alphas = render_motion(prepared, motion, views)
     recorded, masks = prepared.recorded(views, frames), prepared.silhouettes(views, frames)
     if loss == "mse":
-        return (images - recorded).square().mean(), (alphas - masks).square().mean()
-    still = (recorded - recorded[:1]).square().mean(), (masks - masks[:1]).square().mean()
+        return functional.mse_loss(images, recorded), functional.mse_loss(alphas, masks)
+    still = (functional.mse_loss(t, t[:1].expand_as(t)) for t in (recorded, masks))
     floors = (STILL_IMAGE, STILL_MASK)
     return tuple(  # type: ignore[return-value]
-        (a - b).square().mean() / (s + floor) for a, b, s, floor in zip((images, alphas), (recorded, masks), still, floors)
+        functional.mse_loss(a, b) / (s + floor) for a, b, s, floor in zip((images, alphas), (recorded, masks), still, floors)
     )
 
 

@@ -42,7 +42,7 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
     Args:
         images: RGB in [0, 1], (..., T, H, W, 3), T >= 2.
         preset: `ultrafast`, `fast` or `medium`.
-        threads: Number of videos to process in parallel; the number of cores where absent.
+        threads: Number of threads; the number of cores where absent.
 
     Returns:
         Flow (..., T - 1, H, W, 2), float32 on the CPU; x points right, y down.
@@ -59,14 +59,20 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
     weights = images.new_tensor([0.299, 0.587, 0.114])
     videos = images.detach().flatten(0, -5) if images.ndim > 4 else images.detach()[None]
 
-    def video(frames: Tensor) -> np.ndarray:
-        grey = (255 * (frames @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
-        search = cv2.DISOpticalFlow_create(PRESETS[preset])
-        return np.stack([search.calc(a, b, None) for a, b in zip(grey, grey[1:])])
+    def grey_of(frames: Tensor) -> np.ndarray:
+        return (255 * (frames @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
 
-    with ThreadPoolExecutor(threads or os.cpu_count()) as pool:  # OpenCV releases the GIL
-        flows = np.stack(list(pool.map(video, videos)))
-    return torch.from_numpy(flows).view(*images.shape[:-4], *flows.shape[1:])
+    def pairs(part: tuple[np.ndarray, int, int]) -> list[np.ndarray]:
+        grey, first, last = part
+        search = cv2.DISOpticalFlow_create(PRESETS[preset])
+        return [search.calc(a, b, None) for a, b in zip(grey[first:last], grey[first + 1 : last + 1])]
+
+    count, workers = images.shape[-4] - 1, threads or os.cpu_count() or 1
+    share = max(1, count * len(videos) // (2 * workers))  # pairs of frames of a task: about two tasks a thread
+    with ThreadPoolExecutor(workers) as pool:  # OpenCV releases the GIL
+        parts = [(grey, k, min(k + share, count)) for grey in pool.map(grey_of, videos) for k in range(0, count, share)]
+        flows = np.stack([flow for found in pool.map(pairs, parts) for flow in found])
+    return torch.from_numpy(flows).view(*images.shape[:-4], count, *flows.shape[1:])
 
 
 class Velocities(NamedTuple):
@@ -145,11 +151,24 @@ def measure_velocities(
 
 
 def as_bytes(images: Tensor) -> Tensor:
-    """Convert images or masks in [0, 1] to bytes, (V, T, ...) uint8, frame by frame to save memory."""
+    """Convert images or masks in [0, 1] to bytes, (V, T, ...) uint8, frame by frame to save memory; the views in parallel on the CPU."""
     out = torch.empty(images.shape, dtype=torch.uint8, device=images.device)
-    for view, own in zip(images.detach(), out):
-        for frame, part in zip(view, own):
-            part.copy_((255 * frame).round_())
+
+    def convert(view: tuple[Tensor, Tensor]) -> None:
+        for frame, part in zip(*view):
+            if frame.is_cuda:
+                part.copy_((255 * frame).round_())
+            else:  # one thread of NumPy a view
+                np.rint(np.float32(255) * frame.numpy(), out=part.numpy(), casting="unsafe")
+
+    pairs = zip(images.detach(), out)
+    if images.is_cuda:
+        for pair in pairs:
+            convert(pair)
+    else:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for _ in pool.map(convert, pairs):
+                pass
     return out
 
 
