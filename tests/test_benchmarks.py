@@ -21,6 +21,7 @@ import plain  # noqa: E402
 import rollout  # noqa: E402
 import room  # noqa: E402
 import scaling  # noqa: E402
+import waits  # noqa: E402
 
 
 def simulator(friction: float, dt: float = 1e-3) -> Simulator:
@@ -116,3 +117,24 @@ def test_memory_in_a_large_domain_follows_the_body(tmp_path):
     assert [int(row[1]) for row in rows] == [24, 2400, 4800]
     assert len({row[3] for row in rows[1:]}) == 1  # eight times the room, the same memory
     assert len({row[5] for row in rows[1:]}) == 1
+
+
+@pytest.mark.slow
+def test_waits_are_measured_with_their_parts(tmp_path, capsys):
+    out = tmp_path / "waits.md"
+    few = ["--scenes", "1", "--steps", "3", "--repeat", "2", "--only", "law,few-shot,test,reconstruct,render"]
+    waits.main(["--small", "--device", "cpu", *few, "--out", str(out)])
+    text = out.read_text()
+    assert text.strip() in capsys.readouterr().out and "failed" not in text
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("| ")]
+    seconds = {cells[0]: float(cells[1]) for cells in lines if cells[0] not in ("what", "part", "---")}
+    assert all(value >= 0 for value in seconds.values())
+    whole = next(value for name, value in seconds.items() if name.startswith("test, "))
+    assert 0 < seconds["score images"] < seconds["prepare"] + seconds["score images"] < 10 * whole
+    assert {"rollout", "backward", "deformation", "measure flow", "optimise"} <= seconds.keys()
+
+
+def test_waits_refuse_unknown_rows(capsys):
+    with pytest.raises(SystemExit):
+        waits.main(["--only", "few-shot,nothing"])
+    assert "nothing: known are" in capsys.readouterr().err

@@ -331,9 +331,11 @@ def _draw(path: Path, module: "ReconstructModule", batch: "MultiViewBatch", body
         cells = [truth, images[v], 1 - (4 * (images[v] - truth).abs()).clamp(0, 1)]
         row = [cv2.resize((255 * cell.numpy()).round().astype(np.uint8), size, interpolation=cv2.INTER_AREA) for cell in cells]
         dots = np.full((size[1], size[0], 3), 255, np.uint8)
-        for p in depths[v].argsort(descending=True).tolist():
-            shade = 40 + 180 * float((depths[v, p] - depths[v].min()) / (depths[v].max() - depths[v].min() + 1e-9))
-            centre = (pixels[v, p] * size[0] / width).round().int().tolist()
-            cv2.circle(dots, centre, 2, (int(shade), int(shade), 220), -1)
+        near, far = depths[v].aminmax()
+        shades = (40 + 180 * ((depths[v] - near) / (far - near + 1e-9)).double()).int()
+        centres = (pixels[v] * size[0] / width).round().int()
+        far_first = depths[v].argsort(descending=True)
+        for (x, y), shade in zip(centres[far_first].tolist(), shades[far_first].tolist()):
+            cv2.circle(dots, (x, y), 2, (shade, shade, 220), -1)
         rows.append(np.concatenate([*row, dots], 1))
     write_image(path, np.concatenate(rows, 0))

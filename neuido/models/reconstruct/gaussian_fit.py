@@ -90,6 +90,8 @@ class ReconstructModule(LightningModule):
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("size", torch.ones(()))
         self.hull: Volume | None = None
+        self.length = self.half_per_depth = 1.0
+        """Size of the body [m], and half images per tangent of the angle of view, on the host: asking the device in each step stops it."""
 
     def gaussians(self) -> Gaussians:
         """Return the current Gaussians, differentiable in the parameters."""
@@ -154,7 +156,12 @@ class ReconstructModule(LightningModule):
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         rates = {name: rate * self.hparams.lr * (float(self.size) if name == "means" else 1) for name, rate in RATES.items()}
-        return torch.optim.Adam([{"params": [getattr(self, name)], "lr": rates[name], "name": name} for name in PARTS], eps=1e-15)
+        groups = [{"params": [getattr(self, name)], "lr": rates[name], "name": name} for name in PARTS]
+        return torch.optim.Adam(groups, eps=1e-15, fused=self.means.is_cuda)
+
+    def on_train_start(self) -> None:
+        self.length = float(self.size)
+        self.half_per_depth = 0.5 * self.batch.cameras.width / float(self.batch.cameras.Ks[:, 0, 0].mean())
 
     def training_step(self, step: Any, batch_idx: int) -> Tensor:
         here = self.global_step
@@ -181,21 +188,20 @@ class ReconstructModule(LightningModule):
     @torch.no_grad()
     def _after_step(self, done: int) -> None:
         self._accumulate_gradient()
-        low, high = math.log(1e-4 * float(self.size)), math.log(self.hparams.max_scale * float(self.size))
+        low, high = math.log(1e-4 * self.length), math.log(self.hparams.max_scale * self.length)
         self.log_scales.clamp_(low, high)
         if done % self.hparams.densify_every == 0 and done <= 0.6 * self.hparams.steps:
             self._densify(done)
         for group in self.optimizers().optimizer.param_groups:
             if group["name"] == "means":
-                group["lr"] = RATES["means"] * self.hparams.lr * float(self.size) * 0.01 ** min(1.0, done / self.hparams.steps)
+                group["lr"] = RATES["means"] * self.hparams.lr * self.length * 0.01 ** min(1.0, done / self.hparams.steps)
 
     def _accumulate_gradient(self) -> None:
         """Accumulate the gradient of the loss with respect to the projected centre of each Gaussian, per half image."""
         cameras = self.batch.cameras
         depth = (self.means @ cameras.viewmats[:, 2, :3].T + cameras.viewmats[:, 2, 3]).mean(1).abs()
-        scale = 0.5 * cameras.width / float(cameras.Ks[:, 0, 0].mean())
         assert self.means.grad is not None  # a step came before
-        self.gradient += self.means.grad.norm(dim=1) * depth * scale
+        self.gradient += self.means.grad.norm(dim=1) * depth * self.half_per_depth
         self.count += 1
 
     def _densify(self, done: int) -> None:
