@@ -14,6 +14,7 @@ def import_data(
     width: str | None = None,
     thickness: str | None = None,
     section_diameter: str | None = None,
+    area: str | None = None,
     compression: bool = False,
     zero: str = "none",
     rows: str = "",
@@ -35,6 +36,11 @@ def import_data(
     diameter: float | None = None,
     volume: float | None = None,
     floor: float | None = None,
+    guide: str = "none",
+    stiffness: float | None = None,
+    inertia: float | None = None,
+    restitution: float | None = None,
+    tilt: float | None = None,
     start: float | None = None,
     end: float | None = None,
     background: str | None = None,
@@ -65,10 +71,11 @@ def import_data(
         columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
         units: Quantity and unit, where the table gives none: --units.force kN.
         strain_unit: Unit of the strain: percent, or a ratio such as mm/mm.
-        length: Gauge length of the specimen with its unit, as "50 mm".
+        length: Gauge length of the specimen, or of a pendulum from the pivot to its centre of mass, with the unit, as "50 mm".
         width: Its width, with a unit.
         thickness: Its thickness, with a unit.
         section_diameter: Of a round specimen, with a unit.
+        area: Cross-section in place of width, thickness and diameter, as "20 mm^2".
         compression: Whether the table counts compression as positive. In mode compression the signs are found.
         zero: Zero of the strain: none, first (the first row, of the stress too), toe (where the straight line of the first loading meets
             zero stress, as in ASTM D638), or a preload as "0.5 N".
@@ -90,7 +97,12 @@ def import_data(
         mass: Of the body in kg.
         diameter: Of the body in m; of a video without --scale, it gives the scale.
         volume: Of a deforming body in m^3; the hull of the first frame where absent.
-        floor: Height of a floor in m.
+        floor: Height of a floor in m; of a body that bounces, that of the tracked point when it touches.
+        guide: What guides the body of a track: none (it flies), pendulum, spring, axis, plane or bounce.
+        stiffness: Of a spring in N/m, or of an axis per moment of inertia in 1/s^2; a rough value.
+        inertia: Of a body on a plane, its moment of inertia over m r^2: 0.4 of a solid ball that rolls, 0 of what slides.
+        restitution: Of a body that bounces; a rough value.
+        tilt: Of the plane, in degrees; x then points down the slope and y away from it.
         start: Of a video, the first moment to use, s.
         end: Of a video, the last moment to use, s.
         background: Of a video, an image of the empty scene; the median of the frames where absent.
@@ -113,16 +125,18 @@ def import_data(
 
     from neuido.data.files.writing import check_writable
     from neuido.data.footage.filming import Filming
+    from neuido.data.importers.declared_guide import Guide
     from neuido.data.importers.importing import import_file
     from neuido.data.importers.machines.loading_path import Preparation
     from neuido.data.importers.machines.testing_machine import Specimen
     from neuido.errors import UserError
 
-    if out is None and not dry_run:
-        raise UserError("give --out FOLDER, or --dry_run true")
     if out is not None and not dry_run:
         check_writable(Path(out).expanduser())
+    unsaid = "give --out FOLDER, or --dry_run true" if out is None and not dry_run else ""
     if _is_scene(files, kind):
+        if unsaid:
+            raise UserError(unsaid)
         _check_scene_options(given)
         from neuido.models.reconstruct.scene_import import PARTICLES, import_scene
 
@@ -136,36 +150,42 @@ def import_data(
         raise UserError("--particles and --opacity_threshold are for scenes alone: leave them out, or give --kind scene")
     if picture is not None:
         check_writable(Path(picture).expanduser().parent, "picture")
-    lines = import_file(
-        files,
-        None if dry_run else out,
-        kind=kind,
-        mode=mode,
-        columns=columns,
-        units={**({"strain": strain_unit} if strain_unit else {}), **(units or {})},
-        specimen=Specimen(length, width, thickness, section_diameter),
-        filming=Filming(start, end, background, cameras, board, synchronise, offsets, picture),
-        compression=compression,
-        preparation=Preparation(rows, average, zero, cycles),
-        step=step,
-        sheet=sheet,
-        forces=forces,
-        region=region,
-        density=density,
-        young=young,
-        poisson=poisson,
-        scale=scale,
-        y_down=y_down,
-        up=up,
-        frame_rate=frame_rate,
-        point=point,
-        mass=mass,
-        diameter=diameter,
-        volume=volume,
-        floor=floor,
-        held_out=[name for name in held_out.split(",") if name],
-    )
+    try:
+        lines = import_file(
+            files,
+            None if dry_run else out,
+            kind=kind,
+            mode=mode,
+            columns=columns,
+            units={**({"strain": strain_unit} if strain_unit else {}), **(units or {})},
+            specimen=Specimen(length if guide == "none" else None, width, thickness, section_diameter, area),
+            filming=Filming(start, end, background, cameras, board, synchronise, offsets, picture),
+            compression=compression,
+            preparation=Preparation(rows, average, zero, cycles),
+            step=step,
+            sheet=sheet,
+            forces=forces,
+            region=region,
+            density=density,
+            young=young,
+            poisson=poisson,
+            scale=scale,
+            y_down=y_down,
+            up=up,
+            frame_rate=frame_rate,
+            point=point,
+            mass=mass,
+            diameter=diameter,
+            volume=volume,
+            floor=floor,
+            guide=Guide(guide, None if guide == "none" else length, stiffness, inertia, restitution, tilt),
+            held_out=[name for name in held_out.split(",") if name],
+        )
+    except UserError as error:
+        raise UserError(f"{error}; and {unsaid}" if unsaid and "give --" in str(error) else str(error)) from error
     print("\n".join(lines))
+    if unsaid:
+        raise UserError(f"nothing is written: {unsaid}")
     print(f"results in {out}" if out is not None and not dry_run else "nothing is written (--dry_run)")
 
 

@@ -13,9 +13,18 @@ DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", 
 """Separators and decimal signs, the most likely first; a blank means any white space."""
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")  # each digit is matched in one way: no time grows with the square
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
-_GROUPED = {".": re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d+)?"), ",": re.compile(r"[+-]?\d{1,3}(\.\d{3})+(,\d+)?")}
-CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?)(?::(\d\d))?")
-"""Time as hours:minutes:seconds, with a date before it or hundredths of a second after it."""
+_MARKS = "'\u2019 \u00a0\u2009\u202f"
+"""Marks between thousands in Switzerland, France and by SI; points and commas do so too."""
+_GROUPED = {
+    ".": re.compile(rf"[+-]?\d{{1,3}}(,\d{{3}})+(\.\d+)?|[+-]?\d{{1,3}}([{_MARKS}]\d{{3}})+(\.\d+)?"),
+    ",": re.compile(rf"[+-]?\d{{1,3}}(\.\d{{3}})+(,\d+)?|[+-]?\d{{1,3}}([{_MARKS}]\d{{3}})+(,\d+)?"),
+}
+CLOCK = re.compile(
+    r"(?:(?P<date>\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}|\d{1,2}/\d{1,2}/\d{4}),?[T ] ?)?(?P<first>\d{1,2}):"
+    r"(?P<second>\d\d(?:[.,]\d{1,9}(?!:))?)(?::(?P<third>\d\d(?:[.,]\d{1,9})?))?(?:(?P<mark>[:;])(?P<frames>\d\d))?"
+    r"(?: ?(?:Z|UTC|[+-]\d\d:?\d\d|(?P<half>[AaPp])\.?[Mm]\.?))?"
+)
+"""Time as hours:minutes:seconds or minutes:seconds, with a date before it, and hundredths of a second or frames after it."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -66,7 +75,7 @@ def read_delimited(path: Path) -> Delimited:
 
 def _titles_in_comment(text: str, rows: list[list[str]], lines: list[int], separator: str) -> tuple[int, list[str]] | None:
     """Return the line and the cells of the comment above a table without titles, `# t x y`, if it has as many cells as a row."""
-    if not rows or not all(is_number(cell) for cell in rows[0] if cell):
+    if not rows or not all(is_number(cell) or CLOCK.fullmatch(cell) for cell in rows[0] if cell):
         return None
     above = [(i, line) for i, line in enumerate(text.splitlines()[: lines[0] - 1], 1) if line.strip()]
     if not above:
@@ -142,5 +151,5 @@ def _with_point(cell: str, decimal: str) -> str:
     if not _in_dialect(cell, decimal):
         return cell
     if _GROUPED[decimal].fullmatch(cell):
-        cell = cell.replace("," if decimal == "." else ".", "")
+        cell = re.sub(rf"[{_MARKS}{',' if decimal == '.' else '.'}]", "", cell)
     return cell.replace(",", ".")

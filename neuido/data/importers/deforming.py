@@ -69,6 +69,8 @@ def write_deforming_body(
         speed = np.linalg.norm(velocity.mean(axis=0))
         summary.append(f"{name}: starts at {speed:.3g} m/s by the first {min(VELOCITY_FRAMES, len(t))} frames, {kind}")
         summary.append(f"{name}: {x.shape[1]} points, {len(t)} frames, volume {body.volume:.4g} m^3 ({body.note})")
+        each = f"{body.volume / len(body.x0):.3g} m^3 each, {1e3 * body.spacing:.3g} mm apart"
+        summary.append(f"{name}: at rest without stress in the first frame; {len(body.x0)} particles of {each}")
         places = {"anchor": x[0].astype(np.float32)} if body.filled else {"track": np.arange(x.shape[1], dtype=np.int32)}
         arrays[name] = {
             "x": x.astype(np.float32),
@@ -105,7 +107,15 @@ def write_deforming_body(
             {"name": name, "role": roles[name], "frame_interval": float(np.median(np.diff(take["t"])))} for name, take in arrays.items()
         ],
     }
-    summary.append(f"floor at y = {floor:g} m" if floor is not None else "no floor (--floor HEIGHT adds one)")
+    summary += [
+        f"model: fixed corotated elasticity, Young's modulus {young:g} Pa (fitted), density {density:g} kg/m^3, Poisson's ratio "
+        f"{elasticity['poisson']:g}{'' if poisson is not None else ' (assumed: --poisson)'}, no plasticity",
+        "gravity 9.81 m/s^2 along -y (--up z where z points up); "
+        + (f"floor at y = {floor:g} m" if floor is not None else "no floor (--floor HEIGHT adds one)"),
+        f"grid of {cells} cells of {1e3 * longest / cells:.3g} mm, steps of {1e3 * dt:g} ms",
+    ]
+    if len(takes) == 1:
+        summary.append("one recording, so that none is held out: a second file would test the answer")
 
     def fill(folder: Path) -> None:
         for name, take in arrays.items():

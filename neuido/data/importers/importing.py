@@ -1,23 +1,28 @@
 """Convert files of testing machines, trackers and motion capture to a folder that `neuido diagnose` reads."""
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from neuido.data.files.parsing import naming
 from neuido.data.files.values import number
 from neuido.data.footage.filming import Filming
 from neuido.data.footage.video_frames import is_video
+from neuido.data.importers.declared_guide import Guide
 from neuido.data.importers.fields.field_exports import BINARY, layout_of
 from neuido.data.importers.machines.loading_path import Preparation
 from neuido.data.importers.machines.material_folder import Material, write_material_tests
 from neuido.data.importers.machines.testing_machine import Specimen
+from neuido.data.importers.plain_motion import Motion
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of
 from neuido.data.importers.tables.titled_tables import read_cells, read_titled
-from neuido.data.importers.tables.titles import find_columns
+from neuido.data.importers.tables.titles import find_columns, named_points
 from neuido.data.importers.track_folder import Axes, RecordedMotion, in_si, write_tracks
-from neuido.data.importers.tracker_exports import Motion, read_motion
+from neuido.data.importers.tracker_exports import layout_of_rows, read_motions
 from neuido.errors import UserError
 
 if TYPE_CHECKING:
@@ -57,6 +62,7 @@ def import_file(
     diameter: float | None = None,
     volume: float | None = None,
     floor: float | None = None,
+    guide: Guide | None = None,
     held_out: Sequence[str] = (),
 ) -> list[str]:
     """Convert files of a testing machine, a tracker or a camera to a folder for `neuido diagnose`.
@@ -80,8 +86,9 @@ def import_file(
         raise UserError(f"--kind {kind} is unknown: choose from {', '.join(KINDS)}")
     if up not in ("y", "z") and not (filming and filming.cameras):
         raise UserError(f"--up {up} must be y or z")
+    guide = guide or Guide()
     for option, value in (("density", density), ("young", young), ("mass", mass), ("diameter", diameter), ("volume", volume),
-                          ("scale", scale), ("frame_rate", frame_rate)):  # fmt: skip
+                          ("scale", scale), ("frame_rate", frame_rate), ("stiffness", guide.stiffness)):  # fmt: skip
         if value is not None:
             number(value, f"--{option}", above=0.0)
     if out is not None and Path(out).expanduser().exists():
@@ -105,6 +112,8 @@ def import_file(
         raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
     with naming(paths[0]):
         chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
+    guided = {key: value for key, value in guide._asdict().items() if value is not None and value != "none"}
+    shared = guided.pop("length", None)  # of a specimen too
     dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
     filmed = {key: None if value == "none" else value for key, value in filming._asdict().items()}
     several = {key: filmed.pop(key) for key in ("board", "synchronise", "offsets")}
@@ -114,11 +123,13 @@ def import_file(
         (("film", "views", "track", "body"), {"scale": scale, "frame_rate": frame_rate}),
         (("film", "track", "body"), {"y_down": y_down, "point": point, "mass": mass, "diameter": diameter}),
         (("body",), {"volume": volume}),
-        (("views", "body"), {"floor": floor}),
+        (("views", "body", "track", "film"), {"floor": floor}),
+        (("track", "film"), {"guide": guided.pop("type", None), **guided}),
         (("material", "field", "body"), {"density": density, "young": young, "poisson": poisson}),
         (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
                          **(preparation or Preparation()).changed()}),
-        (("material", "field"), dimensions),
+        (("material", "field"), {key: value for key, value in dimensions.items() if key != "length"}),
+        (("material", "field", "track", "film"), {"length": shared or dimensions["length"]}),
         (("material", "film", "views", "track", "body"), {"held_out": held_out or None}),
         (("field",), {"forces": forces, "region": region}),
         (("film", "views"), filmed),
@@ -136,15 +147,16 @@ def import_file(
             )
             return summary + _contact_sheet(contact, filming)
 
-    def read(path: Path) -> RecordedMotion:
+    def read(path: Path) -> dict[str, RecordedMotion]:
         if contact is None:
-            return in_si(path, read_motion(path, columns), units, axes)
+            return {own: in_si(path, motion, units, axes) for own, motion in read_motions(path, columns, frame_rate).items()}
         from neuido.data.footage.centre_track import read_centres
 
         found = read_centres(path, filming, frame_rate=frame_rate, diameter=diameter, scaled=scale is not None, sheet=contact)
         motion = Motion(found.t, {"object": found.x}, found.unit, False, found.notes, True)
-        return in_si(path, motion, units, axes._replace(y_down=False))._replace(scale_error=found.scale_error)
+        return {"": in_si(path, motion, units, axes._replace(y_down=False))._replace(scale_error=found.scale_error)}
 
+    said = [f"read as {WHAT[chosen]} (--kind {chosen})"] if kind == "auto" and not films else []
     if chosen == "material":
         summary = write_material_tests(
             files_by_name,
@@ -173,32 +185,40 @@ def import_file(
             specimen=specimen or Specimen(),
             material=Material(density, young, poisson),
         )
-    elif chosen == "track":
-        summary = write_tracks(files_by_name, read, out, held_out=held_out, point=point, mass=mass, diameter=diameter)
     else:
-        from neuido.data.importers.deforming import write_deforming_body
-
-        summary, takes = [], {}
+        takes: dict[str, tuple[Path, RecordedMotion]] = {}
+        of_file: dict[str, list[str]] = {}
         for name, path in files_by_name.items():
             with naming(path):
-                t, points, notes, _ = read(path)
-            summary += [f"{path.name}: {note}" for note in notes]
-            takes[name] = (t, points)
-        with naming(paths[0]):
-            summary += write_deforming_body(
-                takes,
-                out,
-                roles=roles_of(list(takes), held_out),
-                density=density,
-                young=young,
-                poisson=poisson,
-                volume=volume,
-                floor=floor,
-            )
+                for label, motion in read(path).items():
+                    own = recording_name(f"{name}-{label}" if label else name, takes)
+                    takes[own] = (path, motion)
+                    of_file.setdefault(name, []).append(own)
+        roles = roles_of(list(takes), held_out, of_file)
+        if chosen == "track":
+            summary = write_tracks(takes, out, roles=roles, point=point, mass=mass, diameter=diameter, guide=guide, floor=floor)
+        else:
+            from neuido.data.importers.deforming import write_deforming_body
+
+            summary = [line for path, motion in takes.values() for line in (f"{path.name}: {note}" for note in motion.notes)]
+            with naming(paths[0]):
+                summary += write_deforming_body(
+                    {name: motion[:2] for name, (_, motion) in takes.items()},
+                    out,
+                    roles=roles,
+                    density=density,
+                    young=young,
+                    poisson=poisson,
+                    volume=volume,
+                    floor=floor,
+                )
+        if len(takes) > 1:
+            summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out')} (--held_out NAMES)")
     summary += _contact_sheet(contact, filming)
     if out is not None:
-        summary.append(f"next: neuido check {out}; neuido diagnose {out} --out {out}-answer")
-    return summary
+        folder, answer = shlex.quote(str(out)), shlex.quote(f"{out}-answer")
+        summary.append(f"next: neuido check {folder}; neuido diagnose {folder} --out {answer}")
+    return said + summary
 
 
 def _check_options(name: str, chosen: str, *groups: tuple[tuple[str, ...], Mapping[str, object]]) -> None:
@@ -232,16 +252,20 @@ def _kind(path: Path, columns: Mapping[str, str]) -> str:
     if path.suffix.lower() in (".c3d", ".trc", ".h5", ".hdf5"):
         return "track"
     rows, _ = read_cells(path)
-    first = rows[0][0].lower() if rows and rows[0] else ""
-    if first in ("scorer", "trajectories", "format version") or first.startswith("pathfiletype"):
+    if layout_of_rows(rows):
         return "track"
-    titles = read_titled(path).titles
-    if layout_of(titles) is not None:
+    table = read_titled(path)
+    if layout_of(table.titles) is not None:
         return "field"
-    found = find_columns(titles, dict(columns))
+    found = find_columns(table.titles, dict(columns), table.units)
     if {"time", "frame"} & set(found):
         if {"x", "y", "z"} & set(found):
-            return "body" if "id" in found else "track"
+            return "body" if {"id", "x", "y", "z"} <= set(found) else "track"
+        if named_points(table.titles):
+            return "track"
         if "angle" in found and not {"force", "displacement", "nominal_stress", "shear_stress"} & set(found):
             return "track"
+        if "displacement" in found and set(found) <= {"time", "frame", "displacement", "recording", "rate"}:
+            unknown = [i for i, title in enumerate(table.titles) if i not in found.values() and np.isfinite(table.data[:, i]).any()]
+            return "track" if not unknown else "material"  # an unknown column may be the force
     return "material"

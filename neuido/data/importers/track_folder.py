@@ -1,19 +1,22 @@
 """Convert motions to SI units, and write one point of each as a folder of tracks."""
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from neuido.data.files.parsing import naming
-from neuido.data.importers.tables.checked_folder import roles_of, write_tables
+from neuido.data.importers.declared_guide import Guide, declared_guide, guided_axes
+from neuido.data.importers.plain_motion import ANGLE, REPEATED, Motion
+from neuido.data.importers.tables.checked_folder import write_tables
 from neuido.data.importers.tables.units import conversion_factor
-from neuido.data.importers.tracker_exports import Motion
 from neuido.data.measured.motion_plausibility import lost_positions
 from neuido.errors import UserError
 
+LEAST_RUN = 5
+"""Rows in order, on average, from which on a file is taken for several recordings one after the other, and not for rows in disorder."""
 EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "µs"), (1e11, 1e3, "ms"))
 """Unix times since 1973 in smaller units than seconds: from which number on, units in a second, and name."""
 
@@ -39,6 +42,8 @@ class RecordedMotion(NamedTuple):
     notes: list[str]
     scale_error: float = 0.0
     """Relative error of the scale; 0 if it is given."""
+    angle: bool = False
+    """Whether the only coordinate of the only point is an angle [rad]."""
 
 
 def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> RecordedMotion:
@@ -51,6 +56,12 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
         raise UserError(f"{path.name} contains no positions: name their columns with --columns.x TITLE --columns.y TITLE")
     notes = list(motion.notes)
     t, order = _times(path, motion, units, axes, notes)
+    if motion.unit.partition(" ")[0] == ANGLE:
+        unit = units.get("angle") or motion.unit.partition(" ")[2]
+        if not unit:
+            raise UserError(f"{path.name} has an angle without a unit: give --units.angle deg or rad")
+        turned = {name: x[order] * conversion_factor(unit, "rad", f"{path.name}, --units.angle") for name, x in motion.points.items()}
+        return RecordedMotion(t, turned, [*notes, f"angle in {unit}"], angle=True)
     unit = units.get("x", motion.unit)
     if axes.scale is not None:
         ratio = axes.scale
@@ -77,37 +88,40 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
 
 
 def write_tracks(
-    files: Mapping[str, Path],
-    read: Callable[[Path], RecordedMotion],
+    takes: Mapping[str, tuple[Path, RecordedMotion]],
     out: str | os.PathLike | None,
     *,
-    held_out: Sequence[str],
+    roles: Mapping[str, str],
     point: str | None,
     mass: float | None,
     diameter: float | None,
+    guide: Guide,
+    floor: float | None = None,
 ) -> list[str]:
     """Write one point of each file as a folder `neuido-track/1`; return the lines of the summary.
 
     Args:
-        files: The files by the names of their recordings.
-        read: Reads the motion of a file in SI units.
+        takes: File and motion in SI units of each recording by its name.
         out: The folder to create. None: check the content and write nothing.
-        held_out: Names of recordings that are only scored.
+        roles: `fit` or `held_out` of each recording.
         point: Name of the point to follow, or `mean`.
         mass: Of the body [kg].
         diameter: Of the body [m].
+        guide: What guides the body.
+        floor: Height of the tracked point when the body touches the floor that it bounces from [m].
 
     Raises:
-        UserError: Something cannot be read or is missing.
+        UserError: Something is missing.
     """
     from neuido.data.measured.track import read_tracks
 
     summary, tables, recordings, scale_error = [], {}, [], 0.0
-    roles = roles_of(list(files), held_out)
-    for name, path in files.items():
+    model, said = declared_guide(guide, floor=floor, mass=mass)
+    for name, (path, (t, points, notes, error, angle)) in takes.items():
         with naming(path):
-            t, points, notes, error = read(path)
             x = one_point(points, point, path)
+        if angle and guide.type not in ("pendulum", "axis"):
+            raise UserError(f"{path.name} has an angle: give --guide pendulum and its length, as --length '0.8 m', or --guide axis")
         scale_error = max(scale_error, error)
         summary += [f"{path.name}: {note}" for note in notes]
         seen = np.isfinite(x).all(axis=1)
@@ -115,20 +129,24 @@ def write_tracks(
             raise UserError(f"{path.name}: the point is seen in {seen.sum()} frames; at least 3 are needed")
         if not seen.all():
             summary.append(f"{path.name}: {int((~seen).sum())} frames without the point are left out")
-        names = "xyz"[: x.shape[1]]
+        names = ["angle"] if angle else list("xyz"[: x.shape[1]])
         still = [axis for a, axis in enumerate(names) if np.ptp(x[seen, a]) == 0]
         if len(still) == len(names):
             raise UserError(f"{path.name}: the point is at the same place in all {seen.sum()} frames: name the right columns, or --point")
         if still:
             summary.append(f"{path.name}: {', '.join(still)} does not change and is left out")
-        kept = [axis for axis in names if axis not in still]
+        kept, left = guided_axes(guide.type, x[seen], names)
+        if left:
+            summary.append(f"{path.name}: {left}")
+        kept = [axis for axis in kept if axis not in still]
         tables[name] = {"t": t[seen] - t[seen][0], **{axis: x[seen, names.index(axis)] for axis in kept}}
         recordings.append({"name": name, "body": "body", "file": f"{name}.csv", "columns": {key: key for key in ("t", *kept)},
                            "role": roles[name]})  # fmt: skip
     figures = {key: value for key, value in (("mass", mass), ("diameter", diameter)) if value is not None}
-    if len(figures) < 2:
+    summary += said
+    if len(figures) < 2 and guide.type == "none":
         summary.append("mass or diameter of the body is unknown (--mass in kg, --diameter in m): forces are reported per unit mass")
-    content = {"format": "neuido-track/1", "name": next(iter(files)), "model": {"gravity": [0.0, -9.81, 0.0]}, "bodies": {"body": figures},
+    content = {"format": "neuido-track/1", "name": next(iter(takes)), "model": model, "bodies": {"body": figures},
                "recordings": recordings}  # fmt: skip
     if scale_error:
         content["nuisances"] = {"length_scale": float(f"{scale_error:.2g}")}
@@ -167,6 +185,7 @@ def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, not
                 t = t / count
                 notes.append(f"times are Unix times in {name}")
                 break
+    _check_repeats(path, t, motion.points, axes.frame_rate)
     order = np.argsort(t, kind="stable")
     order = order[np.isfinite(t[order])]
     kept = order[np.concatenate([[True], np.diff(t[order]) > 0])] if len(order) else order
@@ -184,3 +203,30 @@ def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, not
         row = int(np.argmax(steps))
         notes.append(f"a gap of {steps.max():.3g} s after {t[row] - t[0]:.4g} s; frames are {np.median(steps):.3g} s apart")
     return t - t[0], kept
+
+
+def _check_repeats(path: Path, t: np.ndarray, points: Mapping[str, np.ndarray], frame_rate: float | None) -> None:
+    """Check that rows are those of one recording, with a clock that tells them apart.
+
+    Raises:
+        UserError: The times start again within the file, or many rows have the time of another and another place.
+    """
+    x = np.column_stack(list(points.values()))
+    rows = np.flatnonzero(np.isfinite(t) & np.isfinite(x).any(axis=1))
+    _, first = np.unique(np.column_stack([t, np.nan_to_num(x)])[rows], axis=0, return_index=True)
+    rows = rows[np.sort(first)]  # without copies
+    back = np.flatnonzero(np.diff(t[rows]) < 0) + 1
+    parts = np.split(t[rows], back)
+    if len(back) and len(rows) >= LEAST_RUN * len(parts):
+        spans = sorted((float(part.min()), float(part.max())) for part in parts)
+        if any(low < end for (_, end), (low, _) in zip(spans, spans[1:])):
+            raise UserError(
+                f"{path.name}: the times start again at data row {rows[back[0]]}: does it hold several recordings? "
+                "Name the column that tells them apart (--columns.recording TITLE), or give each a file"
+            )
+    repeated = len(rows) - len(np.unique(t[rows]))
+    if repeated > max(REPEATED * len(rows), 4):
+        raise UserError(
+            f"{path.name}: {repeated} of {len(rows)} rows have the time of another row and another place: the clock is too coarse; export "
+            "times with more digits, or give --columns.frame TITLE and --frame_rate"
+        )

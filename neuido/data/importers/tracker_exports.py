@@ -1,18 +1,15 @@
 """Reader of tracker and motion-capture exports: OptiTrack, Vicon, TRC, DeepLabCut, C3D and plain tables."""
 
-import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from neuido.data.files.delimited import is_number
 from neuido.data.files.parsing import parser_errors
 from neuido.data.importers.pandas_hdf5 import read_frame
-from neuido.data.importers.tables.titled_tables import read_cells, read_titled
-from neuido.data.importers.tables.titles import find_columns
-from neuido.data.importers.tables.units import conversion_factor
+from neuido.data.importers.plain_motion import Motion, read_plain
+from neuido.data.importers.tables.titled_tables import read_cells
 from neuido.errors import UserError
 from neuido.physics.runtime.lazy import import_extra
 
@@ -20,48 +17,36 @@ MIN_LIKELIHOOD = 0.6
 """Smallest likelihood at which a point of DeepLabCut counts as seen."""
 
 
-class Motion(NamedTuple):
-    """Positions of named points in T frames."""
-
-    t: np.ndarray
-    """Times [s] (T,), or frame numbers if `frames` is true."""
-    points: dict[str, np.ndarray]
-    """Positions (T, A) of each point by name; NaN if not seen."""
-    unit: str
-    """Unit of the positions; empty if the file states none."""
-    frames: bool
-    """Whether `t` holds frame numbers."""
-    notes: list[str]
-    """How the file was read, for the summary."""
-    timed: bool = False
-    """Whether the file states the unit of its times."""
-
-
-def read_motion(path: Path, columns: dict[str, str]) -> Motion:
-    """Read a tracker export; detect its layout from its content.
+def read_motions(path: Path, columns: dict[str, str], frame_rate: float | None = None) -> dict[str, Motion]:
+    """Read a tracker export; detect its layout from its content. Return the motion of each recording in it by its name.
 
     Args:
         path: The file.
         columns: Title of the column of a quantity, for plain tables whose titles are not recognised.
+        frame_rate: Frames a second, for timecodes [1/s].
 
     Raises:
         UserError: The layout is unknown, or the file is malformed.
     """
     if path.suffix.lower() == ".c3d":
-        return _c3d(path)
+        return {"": _c3d(path)}
     if path.suffix.lower() in (".h5", ".hdf5"):
-        return _deeplabcut_hdf5(path)
-    rows, notes = read_cells(path)
+        return {"": _deeplabcut_hdf5(path)}
+    rows, _ = read_cells(path)
+    layout = layout_of_rows(rows)
+    return {"": LAYOUTS[layout](path, rows)} if layout else read_plain(path, columns, frame_rate)
+
+
+def layout_of_rows(rows: list[list[str]]) -> str:
+    """Return the name of the layout of a tracker's export by its first cells, a key of `LAYOUTS`; empty for a plain table."""
     first = [cell.lower() for cell in rows[0]] if rows else []
     if "format version" in first:
-        return _optitrack(path, rows)
+        return "optitrack"
     if first and first[0].startswith("pathfiletype"):
-        return _trc(path, rows)
-    if first and first[0] in ("trajectories", "model outputs"):
-        return _vicon(path, rows)
-    if first and first[0] == "scorer":
-        return _deeplabcut(path, rows)
-    return _plain(path, columns)
+        return "trc"
+    if first and first[0] in VICON:
+        return "vicon"
+    return "deeplabcut" if first and first[0] == "scorer" else ""
 
 
 def _floats(rows: list[list[str]], width: int) -> np.ndarray:
@@ -104,7 +89,14 @@ def _trc(path: Path, rows: list[list[str]]) -> Motion:
     return Motion(data[:, 1], points, info.get("units", "mm"), False, [f"TRC, {len(points)} markers"])
 
 
+VICON = ("trajectories", "model outputs", "devices", "joints", "segments", "events")
+"""Sections of an export of Vicon; trajectories have the markers, and model outputs may have points too."""
+
+
 def _vicon(path: Path, rows: list[list[str]]) -> Motion:
+    starts = [i for i, row in enumerate(rows) if row[0].lower() in VICON]
+    section = next((i for i in starts if rows[i][0].lower() == "trajectories"), starts[0])
+    rows = rows[section : next((i for i in starts if i > section), None)]
     if len(rows) < 6 or not is_number(rows[1][0]) or not float(rows[1][0]) > 0:
         raise UserError(f"{path}: a Vicon export has the frame rate in its second row; it is missing")
     first, data = _numbers_from(path, rows, 4)
@@ -116,7 +108,11 @@ def _vicon(path: Path, rows: list[list[str]]) -> Motion:
 
 def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
     first, data = _numbers_from(path, rows, 3)
-    return _poses(data[:, 0], rows[1][1:], rows[2][1:], data[:, 1:])
+    named = [row for row in rows[1 : first - 1] if row[0].lower() in ("individuals", "bodyparts")]
+    if rows[first - 1][0].lower() != "coords" or not named:
+        raise UserError(f"{path}: an export of DeepLabCut has rows bodyparts and coords above its numbers: export it again")
+    names = ["-".join(filter(None, cells)) for cells in zip(*(row[1:] for row in named))]
+    return _poses(data[:, 0], names, rows[first - 1][1:], data[:, 1:])
 
 
 def _deeplabcut_hdf5(path: Path) -> Motion:
@@ -157,54 +153,5 @@ def _c3d(path: Path) -> Motion:
     return Motion(np.arange(len(x)) / rate, points, unit or "mm", False, [f"C3D, {len(points)} markers, {rate:g} Hz"])
 
 
-def _plain(path: Path, columns: dict[str, str]) -> Motion:
-    table = read_titled(path)
-    found = find_columns(table.titles, columns)
-    axes = [axis for axis in "xyz" if axis in found]
-    clock = next((name for name in ("time", "frame") if name in found), None)
-    if not axes and "angle" in found:
-        raise UserError(
-            f"{path.name} has the angle of a body on a pivot, which `neuido import` does not read: write a folder with "
-            "constraint: pendulum (docs/formats/track.md), or give x and y of the bob by --columns.x and --columns.y"
-        )
-    if not axes or clock is None:
-        titles = ", ".join(filter(None, table.titles))
-        raise UserError(
-            f"{path.name} has no time or no position: name their columns with --columns.time TITLE --columns.x TITLE (titles: {titles})"
-        )
-    if "z" in axes and "y" not in axes:
-        title = table.titles[found["z"]]
-        raise UserError(f"{path.name} has z and no y, which points up: give --columns.y {title!r} if {title!r} is the height")
-    units = {table.units[found[axis]] for axis in axes}
-    if len(units) > 1:
-        raise UserError(f"{path.name}: the axes have different units ({', '.join(sorted(units))}): export them in one unit")
-    t, timed = table.data[:, found[clock]], False
-    if clock == "time" and table.units[found["time"]]:
-        t = t * conversion_factor(table.units[found["time"]], "s", f"{path.name}, time")
-        timed = True
-    x = table.data[:, [found[axis] for axis in axes]]
-    notes = [*table.notes, *(f"column {found[key] + 1} {table.titles[found[key]]!r} -> {key}" for key in (clock, *axes))]
-    if "x" not in axes:
-        x = np.column_stack([np.zeros(len(x)), x])
-    if "id" not in found:
-        return Motion(t, {_label(path): x}, units.pop(), clock == "frame", notes, timed)
-    ids, times = table.data[:, found["id"]], np.unique(t[np.isfinite(t)])
-    unnamed = int((~np.isfinite(ids) & np.isfinite(t) & np.isfinite(x).any(axis=1)).sum())
-    if unnamed:
-        title = table.titles[found["id"]]
-        raise UserError(f"{path.name}: {unnamed} rows have a position and no number in column {title!r}: give each point a number")
-    points, repeated = {}, 0
-    for own in np.unique(ids[np.isfinite(ids)]):
-        chosen = (ids == own) & np.isfinite(t)
-        values = np.full((len(times), x.shape[1]), np.nan)
-        values[np.searchsorted(times, t[chosen])] = x[chosen]
-        repeated += int(chosen.sum()) - len(np.unique(t[chosen]))
-        points[f"{own:g}"] = values
-    notes.append(f"{len(points)} points by id")
-    if repeated:
-        notes.append(f"{repeated} rows repeat the time of a point, of which the last counts")
-    return Motion(times, points, units.pop(), clock == "frame", notes, timed)
-
-
-def _label(path: Path) -> str:
-    return re.sub(r"[^\w-]+", "-", path.stem).strip("-._") or "track"
+LAYOUTS = {"optitrack": _optitrack, "trc": _trc, "vicon": _vicon, "deeplabcut": _deeplabcut}
+"""Reader of each layout that is told by the first cells."""

@@ -21,6 +21,8 @@ MAX_LEFT = 0.03
 """Share of its range that a parabola leaves of a flight, at the most."""
 FASTEST, SLOWEST = 30.0, 3e-3
 """Acceleration, relative to gravity, above which lengths are in another unit, and below which times are: (1/30)^2 is that of frames."""
+UPRIGHT, BENT = 0.8, 5.0
+"""Share of gravity that a fall along an axis has at the least, and how many times the noise it is seen above."""
 FARTHEST = 1e3
 """Distance [m] above which positions are taken to be in another unit."""
 GAP = 10.0
@@ -71,7 +73,44 @@ def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where:
     sign = f"{axis} points down" if ratio < 0 else ""
     unit = "the unit is not metres" if abs(ratio) > FASTEST else ""
     raise UserError(
-        f"{told}: {' and '.join(filter(None, (unit, sign)))}; give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import --scale`"
+        f"{told}: {' and '.join(filter(None, (unit, sign)))}; give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import` with "
+        f"{' and '.join(filter(None, ('--scale' if unit else '', '--y_down true' if sign else '')))}"
+    )
+
+
+def check_upright(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], axes: Sequence[str], where: str) -> None:
+    """Check that a free flight falls along the declared gravity, and not along another axis.
+
+    Args:
+        t: Times [s], (n,).
+        x: Coordinates [m], (n, A).
+        gravity: Declared gravity along each axis [m/s^2].
+        axes: Names of the axes.
+        where: Name of the recording in error messages.
+
+    Raises:
+        UserError: The body falls by about this acceleration along another axis, and not along that of gravity.
+    """
+    size = float(np.linalg.norm(gravity))
+    if len(t) < 6 or size < 1 or max(map(abs, gravity)) < UPRIGHT * size:
+        return
+    time = t - t[0]
+    found, left, bent = {}, {}, {}
+    for a, axis in enumerate(axes):
+        curve = np.polynomial.Polynomial.fit(time, x[:, a], 2).convert()
+        span = max(float(np.ptp(x[:, a])), 1e-30)
+        found[axis] = 2 * float(curve.coef[2]) if len(curve.coef) > 2 else 0.0
+        left[axis] = float(np.std(x[:, a] - curve(time)))
+        bent[axis] = left[axis] < MAX_LEFT * span and abs(found[axis]) * float(time[-1]) ** 2 / 8 > BENT * left[axis]
+    down = axes[int(np.argmax(np.abs(gravity)))]
+    other = max(found, key=lambda axis: abs(found[axis]))
+    level = abs(found[down]) < (1 - UPRIGHT) * size
+    if other == down or not level or not bent[other] or not UPRIGHT < abs(found[other]) / size < 2 - UPRIGHT:
+        return
+    change = "--up z" if other == "z" and found[other] < 0 else "--columns.y for the height (and --y_down true where it points down)"
+    raise UserError(
+        f"{where}: the acceleration along {other} is {found[other]:.3g} m/s^2, as of gravity, and {found[down]:.2g} along {down}, where "
+        f"gravity is declared: is {other} the vertical? Give {change} to `neuido import`, or another model.gravity"
     )
 
 
@@ -288,6 +327,7 @@ def check_motion(
     whole = x[:, np.isfinite(x).all(axis=(0, 2))]
     if len(t) > 2 and whole.shape[1]:
         middle = whole.mean(axis=1)
+        check_upright(t, middle, gravity, "xyz", where)
         for a, axis in enumerate("xyz"):
             check_flight(t, middle[:, a], gravity[a], axis, where)
         if not np.ptp(whole, axis=0).any():

@@ -210,8 +210,11 @@ def test_particles_of_a_body(tmp_path):
     said = neuido.import_file(late, None, density=1000.0, young=5e4)
     assert "late: 1 points that are not seen in the first frame are left out" in said
     assert "late.csv: 1 rows repeat the time of a point, of which the last counts" in said
-    with pytest.raises(UserError, match="1 rows have a position and no number in column 'id'"):
-        neuido.import_file(write(tmp_path / "named.csv", ["t,id,x,y,z", *lines, f"{T[0]},tip,0.5,0.5,0.5"]), None)
+    with pytest.raises(UserError, match="1 rows have a position and no name in column 'id'"):
+        neuido.import_file(write(tmp_path / "named.csv", ["t,id,x,y,z", *lines, f"{T[0]},,0.5,0.5,0.5"]), None)
+    named = [line.replace(",", ",P", 1) for line in lines]
+    said = neuido.import_file(write(tmp_path / "named.csv", ["t,id,x,y,z", *named]), None, density=1000.0, young=5e4)
+    assert "named.csv: 64 points by id" in said and any("particles of" in line and "at rest" in line for line in said)
 
 
 @settings(max_examples=15, deadline=None)

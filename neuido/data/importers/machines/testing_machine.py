@@ -14,11 +14,17 @@ from neuido.errors import UserError
 
 MODES = ("uniaxial", "compression", "equibiaxial", "pure_shear", "biaxial", "simple_shear")
 _SIZES = {"length": r".*gau?ge length|.*(specimen|sample) (length|height)|length|messl.nge|einspannl.nge|anfangsl.nge|l0|(\w+ )?height|"
-          r"gap|h.he", "width": r"(\w+ )?width|breite|probenbreite", "thickness": r"(\w+ )?thickness|dicke|probendicke",
-          "diameter": r"(\w+ )?diameter|durchmesser"}  # fmt: skip
+          r"gap|h.he|.*messl.nge.*|longueur( \w+)?|longitud( \w+)?", "width": r"(\w+ )?width|breite|probenbreite|largeur|ancho|anchura",
+          "thickness": r"(\w+ )?thickness|dicke|probendicke|.paisseur|espesor",
+          "diameter": r"(\w+ )?diameter|durchmesser|diam.tre|di.metro",
+          "area": r".*cross[- ]?section\w*( area)?|(specimen |initial )?area|.*querschnitt\w*|section initiale|.rea"}  # fmt: skip
 _COMPRESSED = re.compile(r"compress|stauch|druck", re.IGNORECASE)
 LARGEST_RATIO = 3.0
 """Largest strain that is taken for a ratio where no unit is given; 300 % and more is rubber in tension."""
+
+
+SENTINELS, FAR = (999.0, 9999.0, 99999.0, 999999.0), 3.0
+"""Numbers that machines write for a missing one, and how many times smaller all others are."""
 
 
 class Specimen(NamedTuple):
@@ -28,6 +34,8 @@ class Specimen(NamedTuple):
     width: str | None = None
     thickness: str | None = None
     diameter: str | None = None
+    area: str | None = None
+    """Cross-section, such as `20 mm^2`; it takes precedence over width, thickness and diameter."""
 
 
 class MeasuredTest(NamedTuple):
@@ -55,7 +63,7 @@ class MachineTable:
 
     def __init__(self, table: Table, name: str, specimen: Specimen, columns: dict[str, str], units: Mapping[str, str]) -> None:
         self.table, self.name, self.units = table, name, units
-        self.found = find_columns(table.titles, columns)
+        self.found = find_columns(table.titles, columns, table.units)
         self.sizes = _sizes(table, specimen)
         self.summary = list(table.notes)
         self.used_area: float | None = None
@@ -71,7 +79,18 @@ class MachineTable:
             raise UserError(f"{self.name}: column {self.title(quantity)!r} has no unit: give --units.{quantity} {unit or 'percent'}")
         known = own or (f"taken as {unit} (--units.{quantity})" if unit else "a ratio")
         self.summary.append(f"column {index + 1} {self.title(quantity)!r} -> {quantity}, {known}")
-        return self.table.data[:, index] * (conversion_factor(own, unit, f"{self.name}, --units.{quantity}") if own else 1.0)
+        values = self._measured(index)
+        return values * (conversion_factor(own, unit, f"{self.name}, --units.{quantity}") if own else 1.0)
+
+    def _measured(self, index: int) -> np.ndarray:
+        """Return a column with NaN in place of 9999 and the like, which stand for a missing number where all others are far smaller."""
+        values = self.table.data[:, index]
+        lost = np.isin(np.abs(values), SENTINELS)
+        others = values[~lost & np.isfinite(values)]
+        if not lost.any() or not len(others) or np.abs(others).max() * FAR > np.abs(values[lost]).min():
+            return values
+        self.summary.append(f"column {index + 1}: {int(lost.sum())} rows with {values[lost][0]:g} count as missing")
+        return np.where(lost, np.nan, values)
 
     def missing(self, what: str, quantity: str) -> UserError:
         titles = ", ".join(filter(None, self.table.titles))
@@ -79,7 +98,7 @@ class MachineTable:
 
     def strain(self, quantity: str) -> np.ndarray:
         """Return a strain as a ratio; one of more than `LARGEST_RATIO` needs a unit."""
-        values = self.table.data[:, self.found[quantity]]
+        values = self._measured(self.found[quantity])
         largest = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 0.0
         known = self.units.get(quantity) or self.table.units[self.found[quantity]]
         out = self.column(quantity, "", required=largest > LARGEST_RATIO)
@@ -95,13 +114,16 @@ class MachineTable:
 
     def area(self) -> float:
         """Return the cross-section of the specimen [m^2]."""
-        if "diameter" in self.sizes:
+        if "area" in self.sizes:
+            out = self.sizes["area"]
+        elif "diameter" in self.sizes:
             out = np.pi / 4 * self.sizes["diameter"] ** 2
         elif "width" in self.sizes and "thickness" in self.sizes:
             out = self.sizes["width"] * self.sizes["thickness"]
         else:
             raise UserError(
-                f"{self.name} has a force: give the cross-section, --width '10 mm' --thickness '2 mm' or --section_diameter '10 mm'"
+                f"{self.name} has a force: give the cross-section, --area '20 mm^2', --width '10 mm' --thickness '2 mm' or "
+                "--section_diameter '10 mm'"
             )
         self.used_area = out
         self.summary.append(f"cross-section of {1e6 * out:g} mm^2 -> nominal stress")
@@ -251,13 +273,18 @@ def _sizes(table: Table, specimen: Specimen) -> dict[str, float]:
         for title, value, unit in _stated(row):
             for name, pattern in _SIZES.items():
                 if re.fullmatch(pattern, bare_title(title)):
-                    sizes[name] = value * conversion_factor(unit, "m", f"{title} in the preamble")
-    return sizes | {name: parse_quantity(text, "m", _OPTIONS.get(name, name)) for name, text in specimen._asdict().items() if text}
+                    sizes[name] = value * conversion_factor(unit, _KINDS.get(name, "m"), f"{title} in the preamble")
+    given = {name: text for name, text in specimen._asdict().items() if text}
+    if given.keys() & {"area", "width", "thickness", "diameter"}:  # a stated section replaces that in the file
+        sizes = {name: value for name, value in sizes.items() if name not in ("area", "diameter")}
+    return sizes | {name: parse_quantity(text, _KINDS.get(name, "m"), _OPTIONS.get(name, name)) for name, text in given.items()}
 
 
+_KINDS = {"area": "m^2"}
+"""SI units of sizes that are no lengths."""
 _OPTIONS = {"diameter": "section_diameter"}
 """Options whose name is not that of the field of `Specimen`."""
-_IN_ONE = re.compile(r"([^:=]{1,60})[:=]\s*([+-]?\d[\d.]*)\s*([a-zA-Zµ]{1,3})\b")
+_IN_ONE = re.compile(r"([^:=]{1,60})[:=]\s*([+-]?\d[\d.]*)\s*([a-zA-Zµ]{1,3}(?:\^?[2²])?(?!\w))")
 
 
 def _stated(row: list[str]) -> list[tuple[str, float, str]]:

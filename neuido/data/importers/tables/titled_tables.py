@@ -2,13 +2,13 @@
 
 import math
 import re
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from neuido.data.files.delimited import CLOCK, is_number, read_delimited
+from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.importers.tables.clocks import clock_seconds, is_clock, over_midnight
 from neuido.data.importers.tables.spreadsheets import is_spreadsheet, read_spreadsheet
 from neuido.data.importers.tables.titles import SPECIMEN, UNIT_IN_TITLE, bare_title, find_columns
 from neuido.data.importers.tables.units import is_unit
@@ -22,6 +22,14 @@ MISSING = ("", "-", "--", "nan", "na", "n/a", "null", "none", "inf", "-inf")
 """Words for a number that is missing."""
 MOST_TABLES = 200
 """Tables of one file, at the most."""
+_STATISTIC = re.compile(
+    r"(mean|average|avg|std|sd|s\.d\.|st\.?dev|standard ?deviation|variance|min|max|minimum|maximum|median|range|sum|total|count|cv|"
+    r"mittelwert|standardabweichung|summe|anzahl|moyenne|m.diane|.cart[- ]type|somme|media|promedio|m.ximo|m.nimo)\.?:?",
+    re.IGNORECASE,
+)
+"""A word that heads a row of a summary below a table."""
+_PAGE = re.compile(r"(page|seite|blatt|p.gina)\b.{0,30}", re.IGNORECASE)
+"""A line between the pages of one table."""
 
 
 class Table(NamedTuple):
@@ -36,6 +44,8 @@ class Table(NamedTuple):
     """Rows above the titles."""
     notes: list[str]
     """How the file was read, for the summary."""
+    cells: list[list[str]]
+    """The n rows as text; a row may be shorter than C."""
     label: str = ""
     """What tells this table from the others of its file: the name of its sheet or of its specimen."""
 
@@ -104,11 +114,14 @@ def _stacked(rows: list[list[str]], path: Path, notes: list[str], numbered: bool
     above = 0
     while True:
         following = _next_titled(rows, stop)
+        while following is not None and _goes_on_after(rows, start, stop, following):
+            stop = _end_of_block(rows, following)
+            following = _next_titled(rows, stop)
         end = len(rows) if following is None else _titles_row(rows, following)
         block = _block(rows[above:end], start - above, end - above, notes)
         block = block._replace(preamble=[*(out[0].preamble if out else []), *block.preamble])
         beside = _side_by_side(block, numbered)
-        out += beside if len(beside) > 1 else _by_specimen(block, rows[start:end])
+        out += beside if len(beside) > 1 else _by_specimen(block)
         if following is None:
             break
         above, start = stop, following
@@ -166,6 +179,18 @@ def _next_titled(rows: list[list[str]], stop: int) -> int | None:
     return None
 
 
+def _goes_on_after(rows: list[list[str]], start: int, stop: int, following: int) -> bool:
+    """Whether the block at `following` is the next page of the one from `start` to `stop`: same titles, and its first column goes on."""
+    above, below = _titles_row(rows, start), _titles_row(rows, following)
+    between = [row for row in rows[stop:below] if not _PAGE.fullmatch(" ".join(filter(None, row)))]
+    if between or above < 0 or rows[above:start] != rows[below:following]:
+        return False
+    first = [_value(row[0]) for row in rows[start:stop] if row and _is_value(row[0])]
+    ahead = next((_value(row[0]) for row in rows[following:] if row and _is_value(row[0])), math.nan)
+    steps = np.diff(first)
+    return len(first) > 1 and abs(ahead - first[-1]) <= 3 * float(np.max(np.abs(steps))) and abs(ahead - first[-1]) < abs(ahead - first[0])
+
+
 def _titles_row(rows: list[list[str]], first: int) -> int:
     """Return the row of titles above the first row of numbers: the one above it, or the next where that is a row of units."""
     units = first > 1 and all(is_unit(cell) for cell in rows[first - 1]) and not all(is_unit(cell) for cell in rows[first - 2])
@@ -183,20 +208,68 @@ def _block(rows: list[list[str]], first: int, stop: int, notes: list[str]) -> Ta
         above, head = rows[first - 2], first - 2
         notes.append("a row of units")
     titles = [" ".join(cell[:LONGEST_TITLE].split()) for cell in above] + [""] * (width - len(above))
+    if head > 0:
+        titles, units = _under_groups(rows[head - 1], titles, units)
     for i, title in enumerate(titles[:width]):
         found = UNIT_IN_TITLE.search(title)
         if found and not units[i] and is_unit(found[1] or found[2] or ""):
             units[i] = (found[1] or found[2] or "").strip()
-    data = np.full((len(rows) - first, width), np.nan)
-    for i, row in enumerate(rows[first:]):
+    cells = _without_summary(rows, first, notes)
+    data = np.full((len(cells), width), np.nan)
+    for i, row in enumerate(cells):
         for j, cell in enumerate(row):
             data[i, j] = _value(cell)
+    for j in {j for row in cells[:LEAST_ROWS] for j, cell in enumerate(row) if is_clock(cell)}:
+        data[:, j] = over_midnight(data[:, j].tolist(), [row[j] if j < len(row) else "" for row in cells])
     empty = int((~np.isfinite(data)).all(axis=1).sum())
     if head > 0:
         notes.append(f"{head} lines of preamble skipped")
     if empty:
         notes.append(f"{empty} rows without data")
-    return Table(titles[:width], units[:width], data, rows[: max(head, 0)], notes)
+    return Table(titles[:width], units[:width], data, rows[: max(head, 0)], notes, cells)
+
+
+def _under_groups(groups: list[str], titles: list[str], units: list[str]) -> tuple[list[str], list[str]]:
+    """Complete titles and units by a row of groups above them, as merged cells of a spreadsheet give it.
+
+    A group's unit is that of the columns under it. Its name is put before titles only if more quantities are recognised then.
+    """
+    if any(map(_is_value, groups)) or sum(map(bool, groups)) < 1 or len(groups) > len(titles):
+        return titles, units
+    wide, last = [], ""
+    for cell in [*groups, *[""] * (len(titles) - len(groups))]:
+        last = " ".join(cell[:LONGEST_TITLE].split()) or last
+        wide.append(last)
+    joined = [f"{group} {title}".strip() if title else "" for group, title in zip(wide, titles)]
+    if len(find_columns(joined)) > len(find_columns(titles)):
+        titles = joined
+    units = list(units)
+    for i, group in enumerate(wide):
+        found = UNIT_IN_TITLE.search(group)
+        unit = (found[1] or found[2] or "").strip() if found else ""
+        if unit and titles[i] and not units[i] and not UNIT_IN_TITLE.search(titles[i]) and is_unit(unit):
+            units[i] = unit
+    return titles, units
+
+
+def _without_summary(rows: list[list[str]], first: int, notes: list[str]) -> list[list[str]]:
+    """Return the rows of a table from `first` on, without its summary: rows headed by a statistic, and rows under other titles."""
+    own = {cell for row in rows[max(first - 2, 0) : first] for cell in row}
+    kept, words = [], []
+    for i, row in enumerate(rows[first:]):
+        filled = [cell for cell in row if cell]
+        if len(filled) > 1 and not any(map(_is_value, filled)) and not own & set(filled) and len(find_columns(row)) > 1:
+            if count := sum(any(map(_is_value, other)) for other in rows[first + i :]):
+                notes.append(f"{count} rows under other titles ({', '.join(filled)[:60]}) are left out")
+            break
+        word = next((cell for cell in filled if _STATISTIC.fullmatch(cell)), None)
+        if word is not None and any(map(_is_value, filled)):
+            words.append(word)
+        else:
+            kept.append(row)
+    if words:
+        notes.append(f"{len(words)} rows of a summary are left out ({', '.join(dict.fromkeys(words))[:60]})")
+    return kept
 
 
 def _side_by_side(table: Table, numbered: bool) -> list[Table]:
@@ -220,6 +293,7 @@ def _side_by_side(table: Table, numbered: bool) -> list[Table]:
                     table.data[:, chosen],
                     table.preamble,
                     [*table.notes, f"columns {chosen[0] + 1} to {chosen[-1] + 1}"],
+                    [[row[i] if i < len(row) else "" for i in chosen] for row in table.cells],
                     labels[0][:40] if labels else str(start // size + 1),
                 )
             )
@@ -227,12 +301,12 @@ def _side_by_side(table: Table, numbered: bool) -> list[Table]:
     return [table]
 
 
-def _by_specimen(table: Table, rows: list[list[str]]) -> list[Table]:
+def _by_specimen(table: Table) -> list[Table]:
     """Split a table by its column that names the specimen of each row."""
     column = next((i for i, title in enumerate(table.titles) if SPECIMEN.fullmatch(bare_title(title))), None)
     if column is None:
         return [table]
-    names = [row[column] if column < len(row) else "" for row in rows[: len(table.data)]]
+    names = [row[column] if column < len(row) else "" for row in table.cells]
     for i in range(1, len(names)):
         names[i] = names[i] or names[i - 1]  # merged cells of a spreadsheet hold their name in the first row
     named = [name for name in dict.fromkeys(names) if name]
@@ -244,25 +318,14 @@ def _by_specimen(table: Table, rows: list[list[str]]) -> list[Table]:
     for name in own:
         chosen = [i for i, other in enumerate(names) if other == name]
         notes = [*table.notes, f"{table.titles[column]} {name[:40]}", *short]
-        out.append(table._replace(data=table.data[chosen], notes=notes, label=name[:40]))
+        cells = [table.cells[i] for i in chosen]
+        out.append(table._replace(data=table.data[chosen], cells=cells, notes=notes, label=name[:40]))
     return out
 
 
 def _value(cell: str) -> float:
-    """Return a cell as a number, a time of day or date and time in seconds; NaN for anything else."""
-    if is_number(cell):
-        return float(cell)
-    found = CLOCK.fullmatch(cell)
-    if found is None:
-        return math.nan
-    hours, minutes, seconds, hundredths = (float((part or "0").replace(",", ".")) for part in found.groups()[1:])
-    days = 0
-    if found[1]:
-        try:
-            days = date.fromisoformat(found[1]).toordinal()
-        except ValueError:
-            return math.nan
-    return 86400.0 * days + 3600 * hours + 60 * minutes + seconds + 0.01 * hundredths
+    """Return a cell as a number, or a clock in seconds; NaN for anything else."""
+    return float(cell) if is_number(cell) else clock_seconds(cell)
 
 
 def _numeric(row: list[str]) -> bool:
@@ -273,4 +336,4 @@ def _numeric(row: list[str]) -> bool:
 
 def _is_value(cell: str) -> bool:
     """Whether a cell is a number or a time."""
-    return is_number(cell) or CLOCK.fullmatch(cell) is not None
+    return is_number(cell) or is_clock(cell)

@@ -1,25 +1,35 @@
-"""Recognise the quantity of a column from its title, in English or German, and the unit that stands in it."""
+"""Recognise the quantity of a column from its title, in English, German, French or Spanish, and the unit that stands in it."""
 
 import re
+import unicodedata
+from collections.abc import Sequence
 
+from neuido.data.importers.tables.units import measures
 from neuido.errors import UserError
 
 
 def _axis(words: str, letters: str, number: str, axis: str) -> str:
     """Return the pattern of a quantity along one of two axes: `stress 1`, `stress_x`, `s1`."""
-    return rf"({words})[ _.#]*({number}|{axis})|({letters})[ _]?{number}"
+    return rf"({words})[ _.#]*({number}{{1,2}}|{axis}{{1,2}})|({letters})[ _]?{number}"
+
+
+def _place(axis: str) -> str:
+    """Return the pattern of a coordinate: `x`, `pos_x`, `X-Position`, `x-Koordinate`."""
+    return rf"{axis}|{axis}[ _-]?(pos|coord|koord)\w*|(pos|coord|koord)\w*[ _-]?{axis}"
 
 
 MEANINGS = {  # quantity: pattern of its title; the first match counts
-    "rate": r".*(strain|shear|displacement|speed|loading|dehn\w*)[ _]*(rate|geschwindigkeit).*|.*geschwindigkeit|.*speed.*|.*velocity.*",
+    "rate": r".*(strain|shear|displacement|speed|loading|dehn\w*)[ _]*(rate|geschwindigkeit).*|.*geschwindigkeit|.*speed.*|.*velocity.*|"
+    r"vitesse.*|velocidad.*",
     "relaxation_modulus": r"relaxation modulus|g\(t\)|e\(t\)|relaxationsmodul",
     "compliance": r"(creep )?compliance|j\(t\)|nachgiebigkeit",
     "storage_modulus": r"storage modulus|[ge]'|speichermodul",
     "loss_modulus": r"loss modulus|[ge]''|[ge]\"|verlustmodul",
     "frequency": r"(angular )?frequency|ang\.? frequency|omega|ω|(kreis)?frequenz",
     "viscosity": r".*viscosity.*|viskosit.t|eta",
-    "true_stress": r"true stress.*|cauchy.*|wahre spannung",
-    "log_strain": r"true strain.*|log\w* strain|hencky.*|wahre dehnung",
+    "true_stress": r"true stress.*|cauchy.*|wahre spannung|contrainte vraie|(esfuerzo|tensi.n) (verdader|real).*",
+    "log_strain": r"true strain.*|log\w* strain|hencky.*|wahre dehnung|"
+    r"d.formation (vraie|logarithmique)|deformaci.n (verdader|real|logar).*",
     "stretch_1": _axis("stretch|lambda", "λ|l", "1", "x"),
     "stretch_2": _axis("stretch|lambda", "λ|l", "2", "y"),
     "strain_1": _axis("strain|eps|epsilon", "e|ε", "1", "x"),
@@ -30,25 +40,41 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "force_2": _axis("force|load|kraft", "f", "2", "y"),
     "displacement_1": _axis("extension|displacement|elongation", "u", "1", "x"),
     "displacement_2": _axis("extension|displacement|elongation", "u", "2", "y"),
-    "shear_stress": r"shear stress|schubspannung|tau",
-    "shear": r"shear strain|amount of shear|shear|scherung|gleitung|gamma|γ",
-    "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ",
-    "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ",
-    "strain": r".*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*",
-    "force": r"(?!.*(cell|rate|step)).*(force|load|kraft).*|f",
-    "displacement": r".*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|verl.ngerung|position|deflection|"
-    r"compression|deformation).*|.*(standard|pr.f|traversen)?weg",
-    "time": r".*time.*|.*zeit.*|t",
-    "frame": r"frame#?|frames?|bild(nummer)?",
-    "id": r"id|particle|marker|point|punkt",
-    "angle": r"(.* )?angle|theta|θ|phi|φ|winkel|rotation",
-    "x": r"x|x[ _]?pos\w*|pos\w*[ _]?x",
-    "y": r"y|y[ _]?pos\w*|pos\w*[ _]?y|height\w*|h.he",
-    "z": r"z|z[ _]?pos\w*|pos\w*[ _]?z",
+    "shear_stress": r"shear stress|schubspannung|tau|contrainte de cisaillement|(esfuerzo|tensi.n) (cortante|de corte|tangencial)",
+    "shear": r"shear strain|amount of shear|shear|scherung|gleitung|gamma|γ|cisaillement|distorsi.n",
+    "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ|.*contrainte.*|.*esfuerzo.*|tensión.*",
+    "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ|.longation relative",
+    "strain": r".*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
+    "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
+    "displacement": r"(?![xyz][ _-]).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|verl.ngerung|position|"
+    r"deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
+    r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub",
+    "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
+    "frame": r"frames?( ?#)?|frame[ _]?(idx|index|no\.?|nr\.?|number|id)|"
+    r"(video )?bild(nummer|nr)?|image( ?(no|nr|number)\.?)?|slice|trame|fotograma",
+    "recording": r"recording|take|trial|run|experiment|clip|video|sequence|throw|"
+    r"aufnahme|durchgang|versuch|wurf|messung|essai|prise|toma|ensayo",
+    "id": r"(particle|marker|point|track|object|node|label)?[ _-]?(id|label)|particle|marker|point|track|node|object|bead|"
+    r"punkt(nr|nummer)?|partikel|marke|marqueur|particule|marcador|part.cula",
+    "angle": r"(.* )?angle|theta|θ|phi|φ|.*winkel|rotation|.*[ _]angle|.ngulo",
+    "x": _place("x") + r"|abscisse|abscisa",
+    "y": _place("y") + r"|height\w*|h.he|hauteur|altura|ordonn.e|ordenada",
+    "z": _place("z"),
 }
-_UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|ms|s|sec|min|pixels?|px"
+_UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|ms|s|sec|min|pixels?|px|deg|rad|°"
 UNIT_IN_TITLE = re.compile(rf"[(\[<]([^()\[\]<>]*)[)\]>]\s*$|(?:[\s_]in\s|\s*[/,;:]\s*|[\s_])({_UNITS})$")
 """The unit at the end of a title: in brackets, or after `in`, a slash, a comma or a blank."""
+POINT = re.compile(r"(?P<name>.*?\w)[ _.:-]*(?P<axis>[xyz])|(?P<first>[xyz])[ _.:-]*(?P<rest>\w.*)")
+"""Title of a coordinate of a named point: `ball_x`, `nose.y`, `Marker 3 Z`, `x1`, `X_ball`."""
+_NO_POINT = re.compile(
+    r"f|m|v|a|q|w|u|n|velocity|speed|vel|acc\w*|acceleration|omega|force|moment|torque|rot\w*|angle|kraft|geschwindigkeit|"
+    r"beschleunigung|e|ma|inde|fle|std|sd|err\w*|sigma|area|"
+    r"(.*[ _])?(rotation|velocity|speed|force)"
+)
+"""What stands before an axis and is no point, or before the last letter of another word."""
+_SIBLINGS = {"strain": "displacement", "displacement": "strain", "nominal_stress": "force", "force": "nominal_stress"}
+"""Quantities that share words, as an elongation in mm or in percent, and are told apart by the unit."""
+_EXPECTED = {"strain": "", "displacement": "m", "nominal_stress": "Pa", "force": "N"}
 SPECIMEN = re.compile(r"(specimen|sample|probe|test|versuch)[ _]?(id|no\.?|nr\.?|number|name|label|index|nummer)?")
 """Title of a column that says which specimen a row belongs to."""
 
@@ -62,12 +88,13 @@ def bare_title(title: str) -> str:
     return bare.strip(" \t:;,").lower()
 
 
-def find_columns(titles: list[str], given: dict[str, str] | None = None) -> dict[str, int]:
+def find_columns(titles: Sequence[str], given: dict[str, str] | None = None, units: Sequence[str] | None = None) -> dict[str, int]:
     """Find the column of each quantity; return the column indices by quantity.
 
     Args:
         titles: Titles of the columns.
         given: Title of the column of a quantity; it takes precedence over recognition.
+        units: Unit of each column, where known; an elongation in percent is a strain, and a strain in mm a displacement.
 
     Raises:
         UserError: A quantity of `given` is unknown, or no column has its title.
@@ -78,13 +105,34 @@ def find_columns(titles: list[str], given: dict[str, str] | None = None) -> dict
             raise UserError(f"--columns has the unknown quantity {quantity!r}: choose from {', '.join(MEANINGS)}")
         if title not in titles:
             raise UserError(f"--columns.{quantity}: no column has the title {title!r}; the titles are {', '.join(filter(None, titles))}")
-        found[quantity] = titles.index(title)
+        found[quantity] = list(titles).index(title)
     for i, title in enumerate(titles):
         bare = bare_title(title)
         if i in found.values() or not bare:
             continue
-        for quantity, pattern in MEANINGS.items():
-            if re.fullmatch(pattern, bare):
-                found.setdefault(quantity, i)
-                break
+        plain = "".join(letter for letter in unicodedata.normalize("NFD", bare) if not unicodedata.combining(letter))
+        quantity = next((name for name, pattern in MEANINGS.items() if re.fullmatch(pattern, bare) or re.fullmatch(pattern, plain)), None)
+        if quantity is None:
+            continue
+        unit, base = units[i] if units is not None else "", re.sub(r"_[12]$", "", quantity)
+        if unit and base in _SIBLINGS and not measures(unit, _EXPECTED[base]) and measures(unit, _EXPECTED[_SIBLINGS[base]]):
+            quantity = _SIBLINGS[base] + quantity[len(base) :]
+        found.setdefault(quantity, i)
     return found
+
+
+def named_points(titles: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Find the columns of points whose titles join a name and an axis; return the column of each axis by point.
+
+    Titles that name another quantity are none, and a point has x and y at least.
+    """
+    taken, points = set(find_columns(titles).values()), dict[str, dict[str, int]]()
+    for i, title in enumerate(titles):
+        found = POINT.fullmatch(bare_title(title)) if i not in taken else None
+        if found is None:
+            continue
+        name, axis = (found["name"], found["axis"]) if found["axis"] else (found["rest"], found["first"])
+        name = re.sub(r"[ _.:-]*(pos\w*|coord\w*)$", "", name) or name
+        if not _NO_POINT.fullmatch(name):
+            points.setdefault(name, {}).setdefault(axis, i)
+    return {name: axes for name, axes in points.items() if {"x", "y"} <= set(axes)}

@@ -11,7 +11,9 @@ from neuido.physics.runtime.once import cached
 _SPELLED = {
     "°c": "degC", "sec": "s", "seconds": "s", "msec": "ms", "n/mm²": "N/mm^2", "n/mm2": "N/mm^2", "mm/mm": "", "-": "", "%": "percent",
     "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "kn": "kN", "newton": "N", "px": "pixel",
-    "meters": "m", "millimeters": "mm", "centimeters": "cm",
+    "meters": "m", "millimeters": "mm", "centimeters": "cm", "metres": "m", "millimetres": "mm", "centimetres": "cm", "inches": "inch",
+    "lbs": "lbf", "lb": "lbf", "pounds": "lbf", "kp": "kgf", "kg": "kgf", "µstrain": "microstrain",
+    "m/m": "", "in/in": "", "cm/cm": "", "secs": "s", "sekunden": "s", "secondes": "s", "segundos": "s", "minuten": "min", "minutes": "min",
 }  # fmt: skip
 
 
@@ -39,6 +41,11 @@ def conversion_factor(unit: str, to: str, where: str) -> float:
     if found is None:
         raise UserError(f"{where}: the unit {unit[:40]!r} cannot be converted to {to or 'a ratio'}")
     return found
+
+
+def measures(unit: str, to: str) -> bool:
+    """Whether a unit is of the kind of `to`, an SI unit; an empty `to` stands for a ratio."""
+    return _ratio(_spelled(unit), to) is not None
 
 
 @lru_cache(512)
@@ -88,4 +95,4 @@ def _names_unit(spelled: str) -> bool:
 def _spelled(unit: str) -> str:
     """Return a unit in pint's spelling."""
     unit = unit.strip().strip("()[]").strip()
-    return _SPELLED.get(unit.lower(), unit.replace("²", "^2"))
+    return _SPELLED.get(unit.lower(), re.sub(r"(?<=m)²|(?<=m)2$", "^2", unit))
