@@ -27,11 +27,10 @@ ONE_RATE = "one loading at one rate shows no effect of time: an elastic law expl
 ONE_LOADING = "the specimen is loaded once, so that a relaxation explains the same"
 STEADY = "rates that go one way, or steady ones, show a viscosity and not its memory"
 LARGE = 0.1
-"""Largest I1 - 3 up to which stiffening and the second invariant act like a change of the shear modulus."""
+"""Largest I1 - 3 up to which stiffening and the second invariant act like a change of the shear modulus. Of 57 folders, none gains or loses
+a candidate with 0.2, and four creep tests in small shear gain two with 0.05."""
 COMPRESSED = 0.25
-"""Least logarithmic compression in which compaction can show."""
-STIFFER = 1.3
-"""Ratio of the stiffness that the data show to the declared one from which fits of a yield stress start there too."""
+"""Least logarithmic compression in which compaction can show. Half of it makes no difference to any of 57 folders."""
 
 
 class _Collection:
@@ -97,7 +96,7 @@ def material_candidates(tests: MaterialTests) -> tuple[tuple[Candidate, ...], di
     if paths:
         _elastic(c, paths, young, mu, stress, largest)
     if paths or c.tests.effects:
-        _plastic(c, paths, mu, stress, largest, {"young": seen} if seen > STIFFER * young and "young" in tests.free else {})
+        _plastic(c, paths, mu, stress, largest, {"young": seen} if seen > young and "young" in tests.free else {})
     if all(test.time is not None or test.mode in CURVES for test in tests.tests):
         names = ("viscosity_shear", "viscosity_bulk", "maxwell", "relaxation_spectrum", "fractional", "hysteresis", "creep")
         if shows_time(fits):
