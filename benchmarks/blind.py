@@ -1,6 +1,7 @@
 """Blind test of diagnoses: experiments with or without an undeclared effect, diagnosed without their keys and then scored against them.
 
     python benchmarks/blind.py --out runs/blind [--cases 60] [--curves 0] [--workers N] [--gpus 1] [--device cpu]
+                               [--engine local|ray] [--address HOST:PORT]
                                [--minutes 0] [--ablation single-recording no-discretisation] [--statistics]
                                [--only make|diagnose|score|replay] [--folders FOLDER ...]
 
@@ -23,13 +24,11 @@ import gc
 import hashlib
 import json
 import math
-import multiprocessing
 import os
 import shutil
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,8 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parent))
 import blind_scores
 
+from neuido.commands.engines.outcome import Share
+from neuido.commands.engines.tasks import ENGINES, map_tasks
 from neuido.data.files.parsing import read_yaml
 from neuido.data.files.writing import atomic_write, write_text
 from neuido.data.undeclared import Case, make_undeclared
@@ -154,27 +155,14 @@ def _with_one_recording(folder: Path, target: Path) -> Path:
     return target
 
 
-def in_parallel(work, tasks: list[tuple], workers: int, gpus: int = 1) -> Iterator[tuple[tuple, Any]]:
-    """Run tasks in separate processes, spread over the first `gpus` GPUs; yield (task, result) as they finish."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    context = multiprocessing.get_context("spawn")
-    shares = context.SimpleQueue()
-    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    for n in range(workers):  # give each worker its own cores, so that their threads do not compete
-        shares.put((available[n::workers] or available, n % gpus if gpus > 1 else None))
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_to, initargs=(shares,)) as pool:
-        waiting = {pool.submit(work, *task): task for task in tasks}
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
-
-
-def _keep_to(shares) -> None:
-    """Pin this process to the next share of the cores, and to its GPU where there are several."""
-    cores, gpu = shares.get()
-    if cores:
-        os.sched_setaffinity(0, cores)
-    if gpu is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)  # read when CUDA starts, which no import here does
+def in_parallel(work, tasks: list[tuple], options: argparse.Namespace) -> Iterator[tuple[tuple, Any]]:
+    """Run tasks by the engine that the options name; yield (task, result) as they finish."""
+    workers = options.workers or (2 if options.device == "cpu" else 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    gpus = 0.0 if options.device == "cpu" else min(options.gpus / workers, 1.0)
+    share = Share(cores // workers if workers <= cores else cores / workers, gpus)
+    for outcome in map_tasks(work, tasks, engine=options.engine, address=options.address, share=share, most=workers):
+        yield tasks[outcome.number], outcome.error or outcome.value
 
 
 def record(path: Path, row: dict[str, Any]) -> None:
@@ -272,6 +260,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, help="number of parallel processes; default: 2 on the CPU, 1 on a GPU")
     parser.add_argument("--gpus", type=int, default=1, help="number of GPUs over which the processes are spread")
+    parser.add_argument("--engine", choices=ENGINES, default="local", help="processes of this machine, or a Ray cluster")
+    parser.add_argument("--address", help="address of the Ray cluster, whose machines see the folders")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--minutes", type=float, default=0.0, help="time limit of a diagnosis [min]; 0: none")
     parser.add_argument("--ablation", nargs="*", choices=RERUN, default=[])
@@ -281,8 +271,8 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=0, help="particles of a body; 0: 1500 to 3000")
     parser.add_argument("--seconds", type=float, default=0.0, help="duration of the recordings of a body [s]; 0: 0.4 to 0.6")
     options = parser.parse_args()
+    options.out = options.out.absolute()  # workers may start elsewhere
     options.out.mkdir(parents=True, exist_ok=True)
-    workers = options.workers or (2 if options.device == "cpu" else 1)
     if options.folders:
         folders = [folder.resolve() for folder in options.folders]
     else:
@@ -290,14 +280,14 @@ def main() -> None:
         folders = [options.out / "cases" / name for name, *_ in cases]
         if options.only in (None, "make"):
             missing = [(*one, str(options.out / "cases"), options.device) for one in cases if not (options.out / "cases" / one[0]).is_dir()]
-            for n, (task, failed) in enumerate(in_parallel(make_one, missing, workers, options.gpus), 1):
+            for n, (task, failed) in enumerate(in_parallel(make_one, missing, options), 1):
                 print(f"made {n} of {len(missing)}: {task[0]}{': FAILED, ' + failed if failed else ''}", flush=True)
         folders = [folder for folder in folders if folder.is_dir()]
     if options.only in (None, "diagnose"):
         places = [(f, options.out / "answers" / how / f.name, how) for how in ("none", *options.ablation) for f in folders]
         asked = [(str(folder), str(place), how, options.device, options.minutes, options.statistics) for folder, place, how in places]
         waiting = [task for task in asked if not (Path(task[1]) / "diagnosis.json").is_file()]
-        for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, workers, options.gpus), 1):
+        for n, (task, failed) in enumerate(in_parallel(diagnose_one, waiting, options), 1):
             place = Path(task[1])
             found = answers(place) or []
             digest = "" if failed else hashlib.sha256((place / "diagnosis.json").read_bytes()).hexdigest()

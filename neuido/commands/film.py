@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from neuido.commands.engines.outcome import Share
 from neuido.data.trajectories.options import FAMILIES, Range
 
 
@@ -26,6 +27,10 @@ def film(
     shard: int = 0,
     shards: int = 1,
     progress: bool = True,
+    engine: str | None = None,
+    address: str | None = None,
+    cpus: float = 1.0,
+    gpus: float = 0.0,
 ) -> None:
     """Film simulated bodies of many materials, as training data for the flow VAE and for the warm-up of the projector.
 
@@ -53,6 +58,11 @@ def film(
         shard: Number of the shard to film, from 0; shards may be filmed at the same time into one folder.
         shards: Number of shards.
         progress: Show a progress bar.
+        engine: Run all shards as tasks: local (processes of this machine) or ray (a cluster that sees the folder; extra scale). Absent:
+            only this shard, in this process.
+        address: Ray cluster: HOST:PORT, ray://HOST:PORT or auto. Absent: RAY_ADDRESS, else a cluster of this machine alone.
+        cpus: Cores for each task.
+        gpus: GPUs for each task, or a fraction of one; 0: it runs on the CPU.
 
     Raises:
         UserError: A parameter range is invalid, the substep is above the stability limit, or the folder holds clips of other options.
@@ -74,7 +84,22 @@ def film(
         samples=samples,
         seed=seed,
     )
-    generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)
+    if engine is None:
+        generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)
+    else:
+        from neuido.commands.engines.shards import run_shards
+
+        options = {"plan": plan, "out": str(Path(out).absolute()), "device": device, "batch": batch, "progress": False}
+        run_shards(
+            generate_clips,
+            options,
+            shard=shard,
+            shards=shards,
+            engine=engine,
+            address=address,
+            share=Share(cpus, gpus),
+            progress=progress,
+        )
     there = sum((Path(out) / f"clip-{i:05d}.npz").is_file() for i in range(count))
     print(
         f"{there} of {count} clips are there: {views} views, {frames} frames, flow of {flow_size} x {flow_size} px; {', '.join(families)}"

@@ -173,6 +173,10 @@ def _help() -> str:
 
 
 def _fail(line: str, status: int) -> None:
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):  # what was printed before the error cannot be written either
+        _discard_output()
     with contextlib.suppress(OSError):  # of a stderr that is closed
         print(f"neuido: {shortened(line)}", file=sys.stderr, flush=True)
     sys.exit(status)

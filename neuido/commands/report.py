@@ -66,7 +66,6 @@ def report(
     diagnosed = _diagnoses(runs)
     if diagnosed is not None:
         target = Path(out)
-        target.parent.mkdir(parents=True, exist_ok=True)
         write_text(target, diagnosed)
         print(f"results in {target}")
         return
@@ -80,7 +79,6 @@ def report(
     if videos:
         parts += _videos(entries, 1e6 * limit)
     target = Path(out)
-    target.parent.mkdir(parents=True, exist_ok=True)
     write_text(target, page(title, "\n".join(parts)))
     print(f"{len(entries)} runs, {len(scenes_of(entries))} scenes\nresults in {target}")
 

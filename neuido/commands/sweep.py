@@ -8,23 +8,36 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from neuido.commands.cli.config_files import find_config
 from neuido.commands.cli.interruption import SIGNALS, STATE
 from neuido.commands.cli.sweep_file import Metric, Run, SweepFile, command_of, read_sweep, runs_of
+from neuido.commands.engines.outcome import Share
+from neuido.commands.engines.tasks import check_engine, map_tasks
 from neuido.data.files.lock import LockHeld, OwnedLock
 from neuido.data.files.score_tables import read_rows, write_rows
 from neuido.data.files.sweep_run import FOLDER, FORMAT, read_status, write_status
-from neuido.data.files.writing import check_writable
+from neuido.data.files.writing import check_writable, made_folder
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 
 
 def sweep(
-    file: str, *, out: str | None = None, shard: int = 0, shards: int = 1, count: int | None = None, seed: int = 0, report: bool = True
+    file: str,
+    *,
+    out: str | None = None,
+    shard: int = 0,
+    shards: int = 1,
+    count: int | None = None,
+    seed: int = 0,
+    report: bool = True,
+    engine: str | None = None,
+    address: str | None = None,
+    cpus: float = 1.0,
+    gpus: float = 0.0,
 ) -> int:
     """Run a wandb sweep file (grid or random) without a server; wandb logs offline, and the results come into one CSV.
 
@@ -42,6 +55,11 @@ def sweep(
         count: Runs of a random sweep, or the first ones of a grid; run_cap of the file where absent.
         seed: Of a random sweep.
         report: Write <out>/report.html (`neuido report`) where runs have scores.
+        engine: Run the runs side by side: local (processes of this machine) or ray (a cluster that sees the folder; extra scale). Absent:
+            one after the other.
+        address: Ray cluster: HOST:PORT, ray://HOST:PORT or auto. Absent: RAY_ADDRESS, else a cluster of this machine alone.
+        cpus: Cores for each run.
+        gpus: GPUs for each run, or a fraction of one; 0: it runs on the CPU.
 
     Returns:
         Exit status: 1 where a run failed or was interrupted.
@@ -53,6 +71,9 @@ def sweep(
         raise UserError(f"shard = {shard} of shards = {shards}: it must be from 0 to shards - 1")
     if count is not None and count < 1:
         raise UserError(f"count = {count}: at least 1 is needed")
+    share = Share(cpus, gpus)
+    if engine is not None:
+        check_engine(engine, address, share)
     path = Path(find_config(file, "FILE"))
     plan = read_sweep(path)
     if plan.early_terminate:
@@ -60,20 +81,40 @@ def sweep(
     runs = runs_of(plan, count=count, seed=seed)
     folder = Path(out or f"runs/sweeps/{plan.name}").absolute()
     check_writable(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     own = runs[shard::shards]
-    with Progress("sweep", len(own), unit="runs") as work:
-        for i, run in enumerate(own, 1):
-            work.say(run.name)
-            work.print(f"[{i}/{len(own)}] {run.name}: {_one(plan, run, folder / run.name)}")
-            work.update()
-            collect(plan, runs, folder)
-    rows = collect(plan, runs, folder)
+    with made_folder(folder):
+        with Progress("sweep", len(own), unit="runs") as work:
+            told = _in_turn(plan, own, folder, work) if engine is None else _side_by_side(plan, own, folder, engine, address, share)
+            for i, (run, words) in enumerate(told, 1):
+                work.print(f"[{i}/{len(own)}] {run.name}: {words}")
+                work.update()
+                collect(plan, runs, folder)
+        rows = collect(plan, runs, folder)
     _summarise(rows, plan.metric, folder)
     if report and any(name.startswith("scores/") for row in rows for name in row):
         _report([str(folder / row["run"]) for row in rows if row["status"] == "done"], folder, path)
     print(f"results in {folder}: results.csv, and a folder a run")
     return int(any(row["status"] in ("failed", "interrupted") for row in rows if row["run"] in {run.name for run in own}))
+
+
+def _in_turn(plan: SweepFile, runs: list[Run], folder: Path, work: Progress) -> Iterator[tuple[Run, str]]:
+    """Run runs one after the other, and yield each with how it went."""
+    for run in runs:
+        work.say(run.name)
+        yield run, _one(plan, run, folder / run.name)
+
+
+def _side_by_side(
+    plan: SweepFile, runs: list[Run], folder: Path, engine: str, address: str | None, share: Share
+) -> Iterator[tuple[Run, str]]:
+    """Run runs as tasks of an engine, and yield each with how it went."""
+    items = [(plan, run, folder / run.name) for run in runs]
+    for outcome in map_tasks(_one, items, engine=engine, address=address, share=share):
+        run = runs[outcome.number]
+        if outcome.error:
+            state = {"format": FORMAT, "run": run.name, "parameters": run.parameters, "status": "failed", "error": outcome.error}
+            write_status(folder / run.name, state)
+        yield run, outcome.value or f"failed: {outcome.error}"
 
 
 def _one(plan: SweepFile, run: Run, folder: Path) -> str:

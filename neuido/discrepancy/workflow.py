@@ -130,7 +130,7 @@ def diagnose(
             raise UserError(problem.refusal(problem.solvers[0]))
     temporary = tempfile.TemporaryDirectory(prefix="neuido-diagnosis-") if out is None else None
     target = Path(temporary.name if temporary else out or "").expanduser()
-    given = {"model": _content(model), "law": _content(law)}
+    given = {"model": hash_of(model), "law": hash_of(law)}
     options = {"effects": names, "draws": draws, "seed": seed, "max_effects": max_effects, "device": chosen, "data": data}
     options |= given | {"solver": solver, "version": store.code_digest()}
     plan = "read-data" if folder is None else store.plan_of(place, options, out=target)
@@ -181,7 +181,7 @@ def _forget(target: Path) -> None:
     (target / "log.csv").unlink(missing_ok=True)
 
 
-def _content(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
+def hash_of(given: str | os.PathLike | Mapping[str, Any] | None) -> str | None:
     """Return a hash of the content of a file or mapping; None stays None."""
     if given is None:
         return None

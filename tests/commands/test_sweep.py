@@ -321,3 +321,26 @@ def test_real_fits_with_wandb_offline(tmp_path):
     assert (out / "latent_dim-4" / "operator.safetensors").is_file()
     assert list((out / "latent_dim-4").rglob("offline-run-*"))
     assert not (ROOT / "operator.safetensors").exists()
+
+
+def test_runs_side_by_side_are_refused_before_anything_is_made(tmp_path, plan):
+    for words, line in (({"engine": "slurm"}, "engine = 'slurm' is not known"), ({"engine": "local", "cpus": -1.0}, "cpus = -1 must be")):
+        with pytest.raises(UserError, match=line):
+            sweep(plan, out=str(tmp_path / "out"), **words)
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made_leaves_none_above_it(tmp_path, plan):
+    with pytest.raises(OSError, match="name too long"):
+        sweep(plan, out=str(tmp_path / "a" / ("x" * 300)))
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_end_as_one_after_the_other(tmp_path, plan, monkeypatch):
+    monkeypatch.setenv("FAIL", "1")
+    assert (
+        sweep(plan, out=str(tmp_path / "one"), report=False) == sweep(plan, out=str(tmp_path / "many"), report=False, engine="local") == 1
+    )
+    rows = [[{**row, "seconds": ""} for row in table(tmp_path / name)] for name in ("one", "many")]
+    assert rows[0] == rows[1] and [row["status"] for row in rows[0]] == ["done", "failed", "done"]

@@ -33,6 +33,7 @@ import numpy as np
 import yaml
 
 from neuido.commands.cli.functions import options_of
+from neuido.commands.cli.trainer_help import HEAVY
 from neuido.commands.main import LIGHT, main
 from neuido.errors import LONGEST
 from tests.faults.fuzzing import BYTES, SECONDS, SWAPS, swap, watched
@@ -52,6 +53,8 @@ WAIT = 60.0
 """Seconds of the clock that a command may sleep without any work in between; one that waits for the processor does not sleep."""
 KINDS = ("file", "value", "words", "configuration", "out", "surroundings", "signal", "file")
 """What an input attacks; damaged files count twice."""
+WRITTEN = ("out", "model.out", "model.save_to", "trainer.default_root_dir", "model.cache")
+"""Options that say where a command writes."""
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 INTERRUPTED = tuple(128 + number for number in SIGNALS)
 
@@ -112,7 +115,7 @@ def run_attack(target: Target, kind: str, number: int, sample: Path, root: Path)
     before = {"in": _tree(box / "in"), "out": _tree(box), "beside": _tree(beside)}
     status, seconds, err, notes = _forked(words, box, root, prepare, None if delay is None else (delay, number_of))
     line = err.strip().splitlines()[-1] if err.strip() else ""
-    fault = _fault(target, kind, what, status, seconds, err, notes) or _traces(box, beside, before, status, what)
+    fault = _fault(target, kind, what, status, seconds, err, notes) or _traces(box, beside, before, status, what, target.command in HEAVY)
     if fault and (log := next((root / "tmp").glob("neuido-*.log"), None)) is not None:
         fault += " | " + " ".join(log.read_text(errors="replace").splitlines()[-4:])[-400:]
     for path in list(root.iterdir()):
@@ -165,7 +168,7 @@ def _value(target: Target, words: list[str], rng: random.Random) -> tuple[list[s
     """Give an option a hostile value; `out` keeps a name inside of the folder."""
     name = rng.choice(_options(target, words))
     new = rng.choice((*NUMBERS, *WORDS, *map(str, VALUES)))
-    if name in ("out", "model.out", "model.save_to", "trainer.default_root_dir", "trainer.logger", "model.cache"):
+    if name in (*WRITTEN, "trainer.logger"):
         new = rng.choice(["", " ", "out/a\nb", "out/" + "x" * 300, "in", "in/scene.yaml", "out/é", "out/\x1b[31m", "out/\ud800", "null"])
     new = new.replace("\0", "").encode("utf-8", "surrogateescape" if "\ud800" not in new else "replace").decode("utf-8", "surrogateescape")
     option = f"--{name}"
@@ -362,23 +365,28 @@ def _fault(target: Target, kind: str, what: str, status: int | None, seconds: fl
     return f"acts outside: {notes[:2]}"[:400] if notes else ""
 
 
-def _traces(box: Path, beside: Path, before: dict[str, dict[str, str]], status: int | None, what: str) -> str:
+def _traces(box: Path, beside: Path, before: dict[str, dict[str, str]], status: int | None, what: str, heavy: bool) -> str:
     """Return what is wrong with the files after a command."""
     now = _tree(beside)
-    if now != before["beside"] and not (what == "a link to a folder in use" and before["beside"].items() <= now.items()):
+    named = what == "a link to a folder in use" or (what == "links inside" and heavy)  # a logger's folder too is named by the user
+    if now != before["beside"] and not (named and before["beside"].items() <= now.items()):
         return f"changes what lies beside: {_difference(before['beside'], now)}"
     now = _tree(box / "in")
-    if now != before["in"] and not (what == "the input" and before["in"].items() <= now.items()):
+    named = what == "the input" or what.startswith(tuple(f"--{name} " for name in WRITTEN))  # new files where the user wants them
+    if now != before["in"] and not (named and before["in"].items() <= now.items()):
         return f"changes its input: {_difference(before['in'], now)}"
     now = _tree(box)
     if left := [path for path in now if ".tmp" in Path(path).name and path not in before["out"]]:
         return f"leaves temporary files: {left[:2]}"
     if what == "full disk":  # work that a full disk ends goes on where it was, when there is space again
-        now = {path: content for path, content in now.items() if not path.startswith("out/.work") and path not in ("out", "out/log.csv")}
+        kept = ("out/.work", "out/log/") if heavy else ("out/.work",)  # of a training, the log of the steps that were done
+        now = {
+            path: content for path, content in now.items() if not path.startswith(kept) and path not in ("out", "out/log", "out/log.csv")
+        }
     if status == 2 and now != before["out"] and what != "full stdout":
         return f"is refused and leaves traces: {_difference(before['out'], now)}"
     for path in now:
-        if path not in before["out"] and (wrong := not_whole(box / path)):
+        if path not in before["out"] and not (named and path.startswith("in/")) and (wrong := not_whole(box / path)):
             return f"leaves {path}, which is not whole: {wrong}"
     return ""
 

@@ -9,7 +9,7 @@ import re
 from argparse import ArgumentError
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any, get_args, get_origin
 
 from neuido.commands.cli.config_files import config_paths, expanded, given_configs, in_place, inline, is_content
 from neuido.commands.cli.signatures import signature
@@ -28,7 +28,7 @@ def run_function(name: str, module: str, function: str, args: list[str]) -> int:
     component = getattr(importlib.import_module(module), function)
     first = next(iter(inspect.signature(component).parameters.values()))
     alone = list(itertools.takewhile(lambda word: not word.startswith("-"), args))  # the first parameter may stand alone
-    if alone and get_origin(first.annotation) is list:
+    if alone and list in (get_origin(first.annotation), *map(get_origin, get_args(first.annotation))):
         args = [f"--{first.name}", json.dumps(alone), *args[len(alone) :]]
     elif alone:
         args = [f"--{first.name}", *args]

@@ -3,6 +3,7 @@
 from collections import Counter
 from pathlib import Path
 
+from neuido.commands.engines.outcome import Share
 from neuido.data.files.writing import check_writable
 from neuido.data.trajectories.options import FAMILIES, Range, Throw, make_trajectories
 
@@ -20,6 +21,10 @@ def trajectories(
     device: str = "auto",
     batch: int = 0,
     progress: bool = True,
+    engine: str | None = None,
+    address: str | None = None,
+    cpus: float = 1.0,
+    gpus: float = 0.0,
 ) -> None:
     """Simulate the constitutive trajectories of Stage I: a spinning cube thrown into a box, for many materials.
 
@@ -39,24 +44,41 @@ def trajectories(
         device: auto, cpu or cuda.
         batch: Trajectories simulated in one launch; 0 chooses 1 on the CPU and 10 on a GPU.
         progress: Show a progress bar.
+        engine: Run all shards as tasks: local (processes of this machine) or ray (a cluster that sees the folder; extra scale). Absent:
+            only this shard, in this process.
+        address: Ray cluster: HOST:PORT, ray://HOST:PORT or auto. Absent: RAY_ADDRESS, else a cluster of this machine alone.
+        cpus: Cores for each task.
+        gpus: GPUs for each task, or a fraction of one; 0: it runs on the CPU.
 
     Raises:
         UserError: An impossible material, a reversed range, a step above the stability limit, a folder that holds another set-up.
     """
     check_writable(Path(out))
-    make_trajectories(
-        out,
-        families=families,
-        instances=instances,
-        held_out=held_out,
-        seed=seed,
-        setup=setup,
-        shard=shard,
-        shards=shards,
-        device=device,
-        batch=batch,
-        progress=progress,
-    )
+    options = {
+        "families": families,
+        "instances": instances,
+        "held_out": held_out,
+        "seed": seed,
+        "setup": setup,
+        "device": device,
+        "batch": batch,
+    }
+    if engine is None:
+        make_trajectories(out, shard=shard, shards=shards, progress=progress, **options)
+    else:
+        from neuido.commands.engines.shards import run_shards
+
+        options |= {"out": str(Path(out).absolute()), "progress": False}
+        run_shards(
+            make_trajectories,
+            options,
+            shard=shard,
+            shards=shards,
+            engine=engine,
+            address=address,
+            share=Share(cpus, gpus),
+            progress=progress,
+        )
     print("\n".join(_summary(Path(out))))
     print(f"results in {out}: `neuido fit --config stage1 --data.root {out}` learns from them")
 

@@ -38,7 +38,7 @@ def claimed_folder(
 ) -> Iterator[Path]:
     """Make a folder for a set-up, or go on with one of the same set-up, and hold it while the block runs.
 
-    Where it is refused, nothing is made or changed.
+    Where it is refused, nothing is made or changed; nor where the block is, before it writes anything.
 
     Args:
         path: The folder.
@@ -59,9 +59,15 @@ def claimed_folder(
     _check_use(path, text, held, file, compared, option, keeps)
     with made_folder(path), held_folder(path, option=option, shard=shard, shards=shards):
         _check_use(path, text, held, file, compared, option, keeps)  # another process may have come first
-        if not (path / file).exists():
+        fresh = not (path / file).exists()
+        if fresh:
             write_text(path / file, text)
-        yield path
+        try:
+            yield path
+        except UserError:
+            if fresh and shards == 1 and _content(path) == [file]:  # refused before anything was made
+                (path / file).unlink()
+            raise
 
 
 @contextlib.contextmanager

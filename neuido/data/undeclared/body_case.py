@@ -222,6 +222,7 @@ class BodyCase:
         ]
         extra = 3 * self.interval  # a fast clock records beyond the end
         true = self.run(self.solver, self.values, started or None, extra)
+        self.events = [[event.words for event in true.events if event.scene == i] for i in range(2)]
         same = true if self.solver == self.suggested else self.run(self.suggested, self.values, started or None, extra)
         self.recorded, reference = (
             [measured_positions(motion, self.markers, i, self.at, self.off[i] if self.off else {}) for i in range(2)]
@@ -250,6 +251,8 @@ class BodyCase:
                 row["separation_over_noise"] = rounded_to_4(self.separations[i] / self.noise)
             row["reference_rms_m"] = rounded_to_4(self.reference[i])
             row["best_achievable_rms_m"] = rounded_to_4(math.hypot(self.noise, self.reference[i]))
+            if self.events[i]:
+                row["events"] = self.events[i]
             rows.append(row)
         material = self.material
         figures = {k: v for part in (material.elasticity, material.plasticity) for k, v in part.items() if k != "law"}

@@ -14,6 +14,7 @@ from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import material
 from neuido.physics.mpm.simulator import Simulator
+from neuido.physics.runtime.events import Event
 from neuido.types import Body, ParticleState, Scene
 
 SPLIT = 2e-3
@@ -54,6 +55,8 @@ class Motion(NamedTuple):
     """Velocities [m/s], (S, K, P, 3)."""
     interval: float
     """Time between frames [s]."""
+    events: tuple[Event, ...] = ()
+    """What makes the motion doubtful: matter that turned inside out or collapsed."""
 
     def at(self, times: np.ndarray, recording: int) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate positions and velocities (T, P, 3) at times [s] (T,) by cubic Hermite splines; before 0 the motion is uniform."""
@@ -105,9 +108,10 @@ def simulate_motion(
         effects = effects._replace(**_moving_floor_force(lift, frames * every, scene.dt))
     with torch.no_grad():
         if own:
-            out = _rollout_with_kicks(simulator, elasticity, plasticity, effects, own, frames, every)
+            out, events = _rollout_with_kicks(simulator, elasticity, plasticity, effects, own, frames, every)
         else:
             out = simulator.rollout(frames * every, elasticity, plasticity, every=every, effects=effects, mass=mass)
+            events = out.events
     place, velocity = (t.double().cpu().numpy().reshape(frames + 1, len(bodies), -1, 3).swapaxes(0, 1) for t in (out.x, out.v))
     if lift is not None:  # transform back from the frame of the floor
         t = np.arange(frames + 1) * interval
@@ -115,7 +119,7 @@ def simulate_motion(
         up = np.array([0.0, 1.0, 0.0])
         place = place + (lift["amplitude"] * (1 - np.cos(w * t)))[None, :, None, None] * up
         velocity = velocity + (lift["amplitude"] * w * np.sin(w * t))[None, :, None, None] * up
-    return Motion(place, velocity, interval)
+    return Motion(place, velocity, interval, tuple(events))
 
 
 OUTSIDE_PREFIXES = ("dry_drag.", "moving_floor.", "delayed_spring.", "magnet.", "density_gradient.")
@@ -171,8 +175,8 @@ def _rollout_with_kicks(
     own: dict[str, dict[str, float]],
     frames: int,
     every: int,
-) -> ParticleState:
-    """Alternate rollouts and velocity updates (Strang splitting).
+) -> tuple[ParticleState, list[Event]]:
+    """Alternate rollouts and velocity updates (Strang splitting); return the frames and the first event of each kind and scene.
 
     Effects of the library with an internal state, such as `maxwell`, cannot be combined with this.
     """
@@ -191,16 +195,18 @@ def _rollout_with_kicks(
         return torch.zeros(count, 3, dtype=t.dtype, device=t.device).index_add_(0, scene, mass[:, None] * t) / total[:, None]
 
     past = [mean(state.x)]
-    kept = [state]
+    kept, events = [state], {}
     for n in range(frames * pieces):
         state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
         out = simulator.rollout(steps, elasticity, plasticity, state=state, effects=effects, every=steps, check=n == 0)
+        for event in out.events:
+            events.setdefault((event.scene, event.kind), event._replace(step=n * steps + event.step, time=n * h + event.time))
         state = ParticleState(*(t[-1] for t in out))
         past.append(mean(state.x))
         state = _kick(state, _fields(own, mean, scene, state, past, h), 0.5 * h)
         if (n + 1) % pieces == 0:
             kept.append(state)
-    return ParticleState(*(torch.stack(parts) for parts in zip(*kept)))
+    return ParticleState(*(torch.stack(parts) for parts in zip(*kept))), list(events.values())
 
 
 def _fields(own: Mapping[str, Mapping[str, float]], mean, scene: Tensor, state: ParticleState, past: list[Tensor], h: float) -> list[Field]:

@@ -70,6 +70,9 @@ def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], 
                 work.say(f"drawn again: {reason}")
         else:
             raise UserError(f"seed {seed} gives no usable case in {TRIES} draws (last reason: {reason}): give another seed or kind")
+        for row in truth.get("recordings", ()):
+            for words in row.get("events", ()):
+                work.print(f"note: {row['name']}: {words}")
     sealed = {**truth, "sealed": {**plan, "attempt": attempt, "salt": rng.bytes(16).hex()}}
     text = yaml.safe_dump(sealed, sort_keys=False, default_flow_style=None, width=140)
     write_folder(hidden)

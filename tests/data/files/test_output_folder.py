@@ -49,6 +49,17 @@ def test_the_same_set_up_goes_on_and_another_is_refused(tmp_path):
         pass
 
 
+def test_work_that_is_refused_before_it_writes_leaves_nothing(tmp_path):
+    folder = tmp_path / "made"
+    for write in (False, True, False):
+        with pytest.raises(UserError, match="refused"), claimed_folder(folder, PLAN, HELD):
+            if write:
+                (folder / "result.txt").write_text("there")
+            raise UserError("refused")
+        assert folder.exists() == (folder / "result.txt").exists() == (folder / "plan.json").exists()
+    assert folder.exists()
+
+
 def test_other_files_are_in_use_and_hidden_ones_are_not(tmp_path):
     (tmp_path / ".cache").write_text("")
     with claimed_folder(tmp_path / "new", PLAN, HELD), claimed_folder(tmp_path / "second", PLAN, HELD):

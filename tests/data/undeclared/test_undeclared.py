@@ -186,12 +186,20 @@ def test_every_group_is_drawn():
 # Effects outside the library, and two of it that only a body shows, against closed forms.
 
 
-def thrown(values, *, velocity=(0.5, 0.0, 0.0), spin=(0.0, 0.0, 0.0), scene=SCENE, seconds=0.2) -> Motion:
+def thrown(values, *, velocity=(0.5, 0.0, 0.0), spin=(0.0, 0.0, 0.0), scene=SCENE, seconds=0.2, law=LAW) -> Motion:
     axis = (np.arange(4) - 1.5) * 0.04
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     launch = bodies.Launch(np.eye(3), np.array([0.4, 0.5, 0.5]), np.array(velocity), np.zeros((3, 3)))
     body = bodies.launched_body(points, 0.04**3, launch, spin=np.array(spin))
-    return simulate_motion(Solver("same", scene.cells, scene.dt), scene, [body], LAW, values, seconds=seconds, interval=0.01)
+    return simulate_motion(Solver("same", scene.cells, scene.dt), scene, [body], law, values, seconds=seconds, interval=0.01)
+
+
+@pytest.mark.parametrize("values", [{}, {"dry_drag.c": 0.1}])
+def test_matter_that_collapses_is_an_event_of_the_motion(values):
+    soft = LAW | {"elasticity": {**LAW["elasticity"], "young": 1e3}}
+    events = thrown(values, velocity=(0.0, -8.0, 0.0), seconds=0.08, law=soft).events
+    assert [event.kind for event in events] == ["collapsed"] and 0.04 < events[0].time < 0.08
+    assert thrown(values, seconds=0.02).events == ()
 
 
 def test_dry_drag_brakes_at_a_constant_rate():

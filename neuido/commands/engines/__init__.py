@@ -1,0 +1,1 @@
+"""Engines that run independent tasks: a pool of processes on this machine, or Ray on many."""
