@@ -99,7 +99,7 @@ class Bench:
         from neuido.data.files.writing import write_arrays
         from neuido.data.scenes.filmed_scene import read_setting, read_truth, write_setting
         from neuido.data.scenes.synthetic import make_scenes
-        from neuido.models.render.gaussians import attach_gaussians, save_ply
+        from neuido.models.render.gaussians import attach_gaussians, save_gaussians
 
         entries = []
         for i in range(self.options.scenes):
@@ -123,7 +123,7 @@ class Bench:
             picked = torch.linspace(0, len(truth.x0) - 1, min(self.size.gaussians, len(truth.x0))).long()
             share = truth.volume[picked] * len(truth.x0) / len(picked)
             colours = torch.rand(len(picked), 3, generator=torch.Generator().manual_seed(0))
-            save_ply(own / "gaussians.ply", attach_gaussians(truth.x0[picked], share, colours, spread=0.5))
+            save_gaussians(own / "gaussians.ply", attach_gaussians(truth.x0[picked], share, colours, spread=0.5))
         return folders
 
     def neuido(self, *arguments: str) -> None:
