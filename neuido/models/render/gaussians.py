@@ -1,9 +1,8 @@
 """Gaussians of a body: spherical harmonics, 3DGS PLY files, and deformation with the particles."""
 
-import functools
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from neuido.data.files.writing import atomic_write
 from neuido.data.formats.gaussian_ply import column_names, read_gaussian_vertices
 from neuido.data.formats.ply import ply_bytes
 from neuido.errors import UserError
+from neuido.models.render.deformation import Average, Congruence
 from neuido.physics.linalg.decompositions import polar
 from neuido.physics.runtime.device import as_device
 from neuido.types import Gaussians
@@ -107,9 +107,7 @@ class Binding(NamedTuple):
 
     def average(self, values: Tensor) -> Tensor:
         """Return the weighted mean over the particles of each Gaussian, (..., P, m) -> (..., N, m)."""
-        index = self.index.to(values.device)
-        parts = (values.index_select(-2, index[:, j]) * w[:, None] for j, w in enumerate(self.weight.to(values).unbind(1)))
-        return functools.reduce(torch.add, parts)
+        return cast(Tensor, Average.apply(values, self.index.to(values.device), self.weight.to(values)))
 
 
 def bind(gaussians: Gaussians, x: Tensor, *, nearest: int = 10, reach: float = REACH) -> Binding:
@@ -161,14 +159,15 @@ def deform(gaussians: Gaussians, F: Tensor, x: Tensor, binding: Binding | None =
             raise UserError(f"{F.shape[-3]} particles carry {len(gaussians.means)} Gaussians; give a binding")
         means, G = x, F
     else:
-        both = binding.average(torch.cat([x, F.flatten(-2)], -1))
-        means, G = gaussians.means + both[..., :3] - binding.rest, both[..., 3:].unflatten(-1, (3, 3))
+        means = gaussians.means + binding.average(x) - binding.rest
+        G = binding.average(F.flatten(-2)).unflatten(-1, (3, 3))
     rotations = None
     if degree_of(gaussians.harmonics) > 0:
         rotations = polar(G)[0]
         if gaussians.rotations is not None:
             rotations = rotations @ gaussians.rotations
-    return gaussians._replace(means=means, covariances=G @ gaussians.covariances @ G.mT, rotations=rotations)
+    covariances = cast(Tensor, Congruence.apply(G, gaussians.covariances.to(G)))
+    return gaussians._replace(means=means, covariances=covariances, rotations=rotations)
 
 
 def covariances_of(scales: Tensor, quaternions: Tensor) -> Tensor:

@@ -147,11 +147,12 @@ def test_gradients_reach_F_and_x_through_the_binding():
     F = (torch.eye(3, dtype=torch.float64) + 0.2 * torch.randn(2, 6, 3, 3, generator=g, dtype=torch.float64)).requires_grad_()
     y = (x + 0.1 * torch.randn(2, 6, 3, generator=g, dtype=torch.float64)).requires_grad_()
 
-    def parts(F, y):
-        moved = deform(body, F, y, binding)
+    def parts(F, y, means, covariances):
+        moved = deform(body._replace(means=means, covariances=covariances), F, y, binding)
         return moved.means, moved.covariances, moved.rotations
 
-    assert torch.autograd.gradcheck(parts, (F, y))
+    own = [t.detach().clone().requires_grad_() for t in (body.means, body.covariances)]
+    assert torch.autograd.gradcheck(parts, (F, y, *own))
     moved = deform(body, F, y, binding)
     G = 0.25 * F[1, 1] + 0.75 * F[1, 2]
     assert torch.allclose(moved.covariances[1, 1], G @ body.covariances[1] @ G.T)
