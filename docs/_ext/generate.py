@@ -135,11 +135,11 @@ def kernels() -> dict[str, str]:
     folder = ROOT / "neuido" / "physics"
     files = [
         p
-        for pattern in ("effects/*kernels.py", "effects/history_functions.py", "mpm/grid.py", "mpm/transfers.py")
+        for pattern in ("effects/*kernels.py", "effects/history_functions.py", "mpm/kernels/grid.py", "mpm/kernels/transfers.py")
         for p in folder.glob(pattern)
     ]
     texts = {p: p.read_text() for p in sorted(files)}
-    on_grid = "neuido/physics/mpm/grid.py"
+    on_grid = "neuido/physics/mpm/kernels/grid.py"
     found = {}
     for field in Effects._fields:
         stem = field.split("_")[0] if field.startswith(("position", "time_force", "maxwell", "fibre", "yield")) else field

@@ -5,7 +5,7 @@ share makes the motion a smooth function of the pose, so that it has gradients. 
 substeps a body at rest comes to lie on the nodes inside, so its resting place is as coarse as the grid. The kinds of contact are those of
 `contact`, for the velocity relative to the solid's own at the node. What a node loses, the solid receives.
 
-The loop over solids carries a velocity. The adjoint recomputes it before each solid, as in `mpm.grid`.
+The loop over solids carries a velocity. The adjoint recomputes it before each solid, as in `mpm.kernels.grid`.
 """
 
 import functools

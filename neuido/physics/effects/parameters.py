@@ -261,7 +261,7 @@ class Effects(NamedTuple):
         return total + (1 - share) * knots[scene, left] + share * knots[scene, right]
 
     def force_table(self, scene_count: int, like: Tensor) -> Tensor:
-        """Return the table of body forces that `mpm.grid.update_grid` reads.
+        """Return the table of body forces that `mpm.kernels.grid.update_grid` reads.
 
         The columns are linear drag, quadratic drag, pull, centre x, y, z, (S, 6). If `magnus`, `stick` or `restitution` is given, five
         follow: magnus x, y, z, stick, restitution, (S, 11).

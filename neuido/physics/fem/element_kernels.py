@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from neuido.physics.colliders import contact as contact_functions
-from neuido.physics.mpm import grid as mpm_grid
+from neuido.physics.mpm.kernels import grid as mpm_grid
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.events import COLLAPSED
 from neuido.physics.runtime.once import cached

@@ -25,6 +25,19 @@ FLAT = 0.1
 """det F below which the stretch is computed from the principal frame, since `warp_functions.Functions.stretch` needs det F > 0."""
 
 
+class LawFunctions(NamedTuple):
+    """Warp functions of one particle for one scalar type; the law is given by its number and its parameters."""
+
+    stress: Any
+    """(F, kind, mu, lambda) -> tau"""
+    stress_gradient: Any
+    """(F, kind, mu, lambda, adjoint of tau) -> adjoints of F, mu and lambda"""
+    correct: Any
+    """(F, kind, parameter) -> corrected F"""
+    correction_gradient: Any
+    """(F, kind, parameter, adjoint of the corrected F) -> adjoints of F and of the parameter"""
+
+
 class LawKernels(NamedTuple):
     """The kernels for one scalar type; each comment lists the arguments.
 
@@ -40,6 +53,8 @@ class LawKernels(NamedTuple):
     """(F, kinds, params (S, 1), scene, corrected)"""
     correct_adjoint: Any
     """(F, kinds, params, scene, grad_corrected, grad_F, grad_params or None); adds to both gradients"""
+    functions: LawFunctions
+    """The same for one particle, for kernels that do more than evaluate a law."""
 
 
 @cached
@@ -109,62 +124,38 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     corotated = corotated_in_frame if builtin_svd else corotated_by_stretch
     logarithmic = hencky_in_frame if builtin_svd else hencky_by_series
 
-    @wp.kernel(enable_backward=enable_backward, module="unique")
-    def stress(
-        F: wp.array(dtype=mat),
-        kinds: wp.array(dtype=wp.int32),
-        params: wp.array2d(dtype=real),
-        scene: wp.array(dtype=wp.int32),
-        tau: wp.array(dtype=mat),
-    ):
-        p = wp.tid()
-        s = wp.min(scene[p], params.shape[0] - 1)
-        mu = params[s, 0]
-        lam = params[s, 1]
-        kind = kinds[s]
-        Fp = F[p]
+    @wp.func
+    def stress_of(Fp: mat, kind: wp.int32, mu: real, lam: real):
+        """Return the Kirchhoff stress [Pa]."""
+        out = mat()
         if kind == NEO_HOOKEAN:
             dJ = bounded(volume_change(Fp))
-            tau[p] = mu * strain(Fp) + (lam * log1p(dJ)) * wp.identity(n=3, dtype=real)
+            out = mu * strain(Fp) + (lam * log1p(dJ)) * wp.identity(n=3, dtype=real)
         elif kind == FIXED_COROTATED:
-            tau[p] = corotated(Fp, mu, lam)
+            out = corotated(Fp, mu, lam)
         else:
-            tau[p] = logarithmic(Fp, mu, lam)
+            out = logarithmic(Fp, mu, lam)
+        return out
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def stress_adjoint(
-        F: wp.array(dtype=mat),
-        kinds: wp.array(dtype=wp.int32),
-        params: wp.array2d(dtype=real),
-        scene: wp.array(dtype=wp.int32),
-        grad_tau: wp.array(dtype=mat),
-        grad_F: wp.array(dtype=mat),
-        grad_params: wp.array2d(dtype=real),
-    ):
-        p = wp.tid()
-        s = wp.min(scene[p], params.shape[0] - 1)
-        mu = params[s, 0]
-        lam = params[s, 1]
-        kind = kinds[s]
-        Fp = F[p]
-        A = grad_tau[p]
+    @wp.func
+    def stress_gradient(Fp: mat, kind: wp.int32, mu: real, lam: real, A: mat):
+        """Return the adjoints of F, mu and lambda from the adjoint A of the stress."""
         trace = A[0, 0] + A[1, 1] + A[2, 2]
+        grad = mat()
+        shear = real(0.0)
+        bulk = real(0.0)
         if kind == NEO_HOOKEAN:
             dJ = volume_change(Fp)
             grad = mu * ((A + wp.transpose(A)) * Fp)
             if one + dJ > floor:
                 grad = grad + (trace * lam / (one + dJ)) * cofactor(Fp)
-            grad_F[p] = grad_F[p] + grad
-            if grad_params:
-                wp.atomic_add(grad_params, s, 0, wp.ddot(A, strain(Fp)))
-                wp.atomic_add(grad_params, s, 1, trace * log1p(bounded(dJ)))
+            shear = wp.ddot(A, strain(Fp))
+            bulk = trace * log1p(bounded(dJ))
         else:
             U, d, V = frame(Fp)
             A = wp.transpose(U) * A * U
             sigma = vec(one + d[0], one + d[1], one + d[2])
             B = mat()
-            shear = real(0.0)
-            bulk = real(0.0)
             if kind == FIXED_COROTATED:
                 dJ = d[0] + d[1] + d[2] + d[0] * d[1] + d[0] * d[2] + d[1] * d[2] + d[0] * d[1] * d[2]
                 cof = vec(sigma[1] * sigma[2], sigma[0] * sigma[2], sigma[0] * sigma[1])
@@ -187,10 +178,38 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                         if i != j:
                             total = wp.max(sigma[i] + sigma[j], gap)
                             B[i, j] = (A[i, j] + A[j, i]) * sigma[j] * two * mu * log_difference(d[i], d[j]) / total
-            grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
-            if grad_params:
-                wp.atomic_add(grad_params, s, 0, shear)
-                wp.atomic_add(grad_params, s, 1, bulk)
+            grad = U * B * wp.transpose(V)
+        return grad, shear, bulk
+
+    @wp.kernel(enable_backward=enable_backward, module="unique")
+    def stress(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        tau: wp.array(dtype=mat),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        tau[p] = stress_of(F[p], kinds[s], params[s, 0], params[s, 1])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def stress_adjoint(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        grad_tau: wp.array(dtype=mat),
+        grad_F: wp.array(dtype=mat),
+        grad_params: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        grad, shear, bulk = stress_gradient(F[p], kinds[s], params[s, 0], params[s, 1], grad_tau[p])
+        grad_F[p] = grad_F[p] + grad
+        if grad_params:
+            wp.atomic_add(grad_params, s, 0, shear)
+            wp.atomic_add(grad_params, s, 1, bulk)
 
     @wp.func
     def limit(q: real, trace: real, kind: wp.int32, param: real):
@@ -259,45 +278,24 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
 
     returned = return_in_frame if builtin_svd else return_by_series
 
-    @wp.kernel(enable_backward=enable_backward, module="unique")
-    def correct(
-        F: wp.array(dtype=mat),
-        kinds: wp.array(dtype=wp.int32),
-        params: wp.array2d(dtype=real),
-        scene: wp.array(dtype=wp.int32),
-        corrected: wp.array(dtype=mat),
-    ):
-        p = wp.tid()
-        s = wp.min(scene[p], params.shape[0] - 1)
-        kind = kinds[s]
-        if kind == IDENTITY:
-            corrected[p] = F[p]
-        else:
-            corrected[p] = returned(F[p], kind, params[s, 0])
+    @wp.func
+    def corrected_of(Fp: mat, kind: wp.int32, param: real):
+        """Return the corrected gradient."""
+        out = Fp
+        if kind != IDENTITY:
+            out = returned(Fp, kind, param)
+        return out
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def correct_adjoint(
-        F: wp.array(dtype=mat),
-        kinds: wp.array(dtype=wp.int32),
-        params: wp.array2d(dtype=real),
-        scene: wp.array(dtype=wp.int32),
-        grad_corrected: wp.array(dtype=mat),
-        grad_F: wp.array(dtype=mat),
-        grad_params: wp.array2d(dtype=real),
-    ):
-        p = wp.tid()
-        s = wp.min(scene[p], params.shape[0] - 1)
-        kind = kinds[s]
-        A = grad_corrected[p]
-        if kind == IDENTITY:
-            grad_F[p] = grad_F[p] + A
-        else:
-            U, d, V = frame(F[p])
+    @wp.func
+    def correction_gradient(Fp: mat, kind: wp.int32, param: real, A: mat):
+        """Return the adjoints of F and of the parameter from the adjoint A of the corrected gradient."""
+        grad = A
+        share = zero
+        if kind != IDENTITY:
+            U, d, V = frame(Fp)
             e = hencky(d)
-            state, trace, q, radius = flow(e, kind, params[s, 0])
-            if state == 0:
-                grad_F[p] = grad_F[p] + A
-            else:
+            state, trace, q, radius = flow(e, kind, param)
+            if state != 0:
                 A = wp.transpose(U) * A * V
                 B = mat()
                 if state == 2:
@@ -318,7 +316,7 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                     slope = zero
                     weight = one
                     if kind == DRUCKER_PRAGER:
-                        slope = -params[s, 0]
+                        slope = -param
                         weight = -trace
                     for i in range(3):
                         B[i, i] = inv[i] * (mean + slope * along + ratio * (g[i] - mean - along * n[i]))
@@ -328,8 +326,39 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                                 sym = z[i] * exp_slope(x) * ratio * log_difference(d[i], d[j])
                                 skew = (z[i] + z[j]) / wp.max(two + d[i] + d[j], gap)
                                 B[i, j] = half * (sym * (A[i, j] + A[j, i]) + skew * (A[i, j] - A[j, i]))
-                    if grad_params:
-                        wp.atomic_add(grad_params, s, 0, weight * along)
-                grad_F[p] = grad_F[p] + U * B * wp.transpose(V)
+                    share = weight * along
+                grad = U * B * wp.transpose(V)
+        return grad, share
 
-    return LawKernels(stress, stress_adjoint, correct, correct_adjoint)
+    @wp.kernel(enable_backward=enable_backward, module="unique")
+    def correct(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        corrected: wp.array(dtype=mat),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        corrected[p] = corrected_of(F[p], kinds[s], params[s, 0])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def correct_adjoint(
+        F: wp.array(dtype=mat),
+        kinds: wp.array(dtype=wp.int32),
+        params: wp.array2d(dtype=real),
+        scene: wp.array(dtype=wp.int32),
+        grad_corrected: wp.array(dtype=mat),
+        grad_F: wp.array(dtype=mat),
+        grad_params: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        s = wp.min(scene[p], params.shape[0] - 1)
+        grad, share = correction_gradient(F[p], kinds[s], params[s, 0], grad_corrected[p])
+        grad_F[p] = grad_F[p] + grad
+        if grad_params:
+            if share != zero:
+                wp.atomic_add(grad_params, s, 0, share)
+
+    functions = LawFunctions(stress_of, stress_gradient, corrected_of, correction_gradient)
+    return LawKernels(stress, stress_adjoint, correct, correct_adjoint, functions)

@@ -99,7 +99,8 @@ class ParametricLaw(Law):
         """
         raise NotImplementedError
 
-    def _kinds(self, device: torch.device) -> Tensor:
+    def kinds(self, device: torch.device) -> Tensor:
+        """Return the number of each scene's law in `classical_kernels`, (S,) int32."""
         cache = self.__dict__.setdefault("_kind_cache", {})
         if device not in cache:  # recorded launches refer to the tensor by its address, so two threads must share one
             cache.setdefault(device, torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device))
@@ -111,7 +112,7 @@ class ParametricLaw(Law):
         F = arrays[0]
         kernel = getattr(classical_kernels.kernels(real_of(F.dtype)), name)
         row = tensors[0].detach().to(F).contiguous()
-        inputs: list[Any] = [F, self._kinds(F.device), row, particles.scene, *arrays[1:]]
+        inputs: list[Any] = [F, self.kinds(F.device), row, particles.scene, *arrays[1:]]
         if name.endswith("adjoint"):
             inputs.append(parameters)
         with torch_stream(F.device):
@@ -154,7 +155,7 @@ class ParametricLaw(Law):
             raise UserError(f"{type(self).__name__} has {len(laws)} scenes: give `particles`, the scene of each F")
         out = torch.zeros_like(F)
         scene = particles.scene.long()
-        kinds = self._kinds(F.device)[scene]
+        kinds = self.kinds(F.device)[scene]
         for law in dict.fromkeys(laws):
             (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
             out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))

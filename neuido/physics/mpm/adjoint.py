@@ -69,7 +69,7 @@ def run_backward(
         attached = attachment_loop(plan, inputs, solids)
         for n in reversed(range(plan.steps if steps is None else steps)):
             if (n + 1) % plan.every == 0:
-                _add(now, gradients, (n + 1) // plan.every)
+                add_frame(now, gradients, (n + 1) // plan.every)
             x, v, C, F, history = state = tuple(t[n] for t in tape.states)
             v_next, C_next, F_next = tape.v[n + 1], tape.C[n + 1], tape.F[n + 1]
             material, a_material = plan.material(inputs, n), plan.material((*inputs[:STATES], *a_fixed), n)
@@ -111,7 +111,7 @@ def run_backward(
                 update_nodes(plan, met, at_step(pull, n), force, friction, free)
                 solids.advance_adjoint(n)
                 solids.meet_adjoint(n, setup.room.index, met, free, a_velocity)
-            arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters]
+            arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters, False]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
             plan.launch(k.update_grid_adjoint, setup.room.count // setup.room.chunk, [*inputs_n, *arguments])
             if solids is not None:
@@ -141,7 +141,7 @@ def run_backward(
                             [*stress_inputs(plan, material), F, history, other, a_tau, a_F, a_history, *a_material[:4]])  # fmt: skip
             elastic.adjoint(F, a_tau, a_F)
             now, then = then, now
-        _add(now, gradients, 0)
+        add_frame(now, gradients, 0)
         if solids is not None:
             solids.end_adjoint()
         of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
@@ -238,7 +238,7 @@ def trial_gradient(plan: Plan, F: Tensor, C_next: Tensor, shrinkage: Tensor, out
     return out
 
 
-def _add(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
+def add_frame(now: Sequence[Tensor], gradients: Sequence[Tensor | None], frame: int) -> None:
     """Add the gradients of one frame to the adjoints of the state."""
     for a, gradient in zip(now, gradients):
         if gradient is not None:

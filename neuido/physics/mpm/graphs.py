@@ -14,9 +14,9 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from neuido.physics.mpm.adjoint import run_backward
 from neuido.physics.mpm.plan import Plan
-from neuido.physics.mpm.rollout import new_tape, run_forward
+from neuido.physics.mpm.rollout import new_tape
+from neuido.physics.mpm.substeps import run_backward, run_forward
 
 T = TypeVar("T")
 

@@ -17,7 +17,7 @@ from neuido.physics.colliders.solid_loop import SolidLoop, SolidTape, new_solid_
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm import transfers as kernels
+from neuido.physics.mpm.kernels import transfers as kernels
 from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step, attachment_loop, solid_loop
 from neuido.physics.runtime.device import real_of, torch_stream
 from neuido.physics.runtime.invalidation import invalidate

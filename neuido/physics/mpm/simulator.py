@@ -76,6 +76,9 @@ class Simulator:
         on_leave: What happens to a particle that leaves the domain. `error`: the rollout raises as soon as the grid, which reaches a cell
             and a half further, holds it no longer. `clamp`: at the faces it keeps its position and loses its velocity outwards.
             `delete`: it stays where it left, at rest, and has no effect on the others. `Frames.events` counts them.
+        fusion: Launches of a substep. `fused`: one for the particles, from gather to scatter, and one for the nodes, where laws and scene
+            allow it. `transfers`: the laws by themselves, between transfers that sum by warp. `separate`: one for each part of a substep,
+            the slow reference. `auto`: the fastest of them on the device.
         keep: Deprecated name of `store`.
 
     Raises:
@@ -103,6 +106,7 @@ class Simulator:
         grid: Literal["domain", "window", "auto"] = "auto",
         on_inversion: OnInversion = "report",
         on_leave: OnLeave = "error",
+        fusion: Literal["auto", "fused", "transfers", "separate"] = "auto",
         keep: Literal["state", "all", "auto"] | None = None,
     ) -> None:
         store = renamed_option("store", store, "keep", keep)
@@ -110,10 +114,12 @@ class Simulator:
             raise UserError(f"store is {store!r}; choose state, all or auto")
         if grid not in ("domain", "window", "auto"):
             raise UserError(f"grid is {grid!r}; choose domain, window or auto")
+        if fusion not in ("auto", "fused", "transfers", "separate"):
+            raise UserError(f"fusion is {fusion!r}; choose auto, fused, transfers or separate")
         self.on_inversion = checked_option(on_inversion)
         self.scenes = (scenes,) if isinstance(scenes, Scene) else tuple(scenes)
         self.bodies = bodies_of(self.scenes, bodies, density)
-        self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store, grid)
+        self.setup = setup = Setup(self.scenes, self.bodies, as_device(device), dtype, store, grid, fusion)
         setup.watch_faces(checked_on_leave(on_leave))
         self.device, self.dtype = setup.device, dtype
         self.particles, self.state, self.mass, self.volume = setup.particles, setup.state, setup.mass, setup.volume

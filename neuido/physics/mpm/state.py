@@ -13,8 +13,8 @@ from neuido.physics.colliders.attachments import attachment_table
 from neuido.physics.colliders.leaving import Leaving
 from neuido.physics.colliders.solid_tables import solid_table
 from neuido.physics.colliders.tables import clamp_table, collider_table, inside_box
-from neuido.physics.mpm import stencil
-from neuido.physics.mpm import transfers as kernels
+from neuido.physics.mpm.kernels import stencil
+from neuido.physics.mpm.kernels import transfers as kernels
 from neuido.physics.mpm.window.nodes import Nodes
 from neuido.physics.mpm.window.placement import FOLLOWED, PIECE, Window, corners
 from neuido.physics.multibody import contact_kernels
@@ -88,6 +88,7 @@ class Setup:
         dtype: Scalar type of the arrays.
         store: As for `Simulator`.
         grid: As for `Simulator`.
+        fusion: As for `Simulator`.
 
     Raises:
         UserError: As `Simulator`.
@@ -109,6 +110,7 @@ class Setup:
         origin: Place of the first node of each scene [m], (S, 3).
         edge: The x of that of the first scene [m].
         keep_grid: Whether a tape stores stress and nodal values too.
+        warps: Scene, first particle and end of each warp of kernels that need them; here, since captured graphs read their memory.
         first_scene: Index of the first scene within the whole simulator, if this is a part of one.
         first_particle: Index of the first particle within the whole simulator.
     """
@@ -121,7 +123,9 @@ class Setup:
         dtype: torch.dtype,
         store: Literal["state", "all", "auto"],
         grid: Literal["domain", "window", "auto"] = "domain",
+        fusion: Literal["auto", "fused", "transfers", "separate"] = "auto",
     ) -> None:
+        self.fusion = fusion
         self.scenes, self.bodies, self.device, self.dtype = tuple(scenes), tuple(bodies), device, dtype
         self.kernels = kernels.build(real_of(dtype))
         self._load_scenes()
@@ -144,6 +148,7 @@ class Setup:
         self.keep_grid = store == "all" or (store == "auto" and self.room.count <= 4 * len(self.mass))
         self.first_scene = self.first_particle = 0
         self.leaving: Leaving | None = None
+        self.warps: list[Tensor] = []
         self._single: dict[int, Setup] = {}
 
     def _load_scenes(self) -> None:
@@ -282,7 +287,7 @@ class Setup:
             own = slice(self.particles.offsets[s], self.particles.offsets[s + 1])
             body = Body(self.state.x[own], self.state.v[own], self.volume[own], self.state.F[own])
             alone = SceneBodies((body,), (1000.0,), own=False, separate=False)
-            one = Setup(self.scenes[s : s + 1], [alone], self.device, self.dtype, "all" if self.keep_grid else "state")
+            one = Setup(self.scenes[s : s + 1], [alone], self.device, self.dtype, "all" if self.keep_grid else "state", fusion=self.fusion)
             one.order = self.order[own] - own.start
             one.sorted_volume, one.sorted_held = self.sorted_volume[own], self.sorted_held[own]
             one.first_scene, one.first_particle = s, own.start

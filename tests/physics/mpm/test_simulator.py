@@ -8,7 +8,7 @@ from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
 from neuido.physics.mpm import reference
-from neuido.physics.mpm import transfers as kernels
+from neuido.physics.mpm.kernels import transfers as kernels
 from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.rollout import to_grid
 from neuido.physics.mpm.simulator import Simulator

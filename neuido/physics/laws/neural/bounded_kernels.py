@@ -219,6 +219,7 @@ def functions(real: type, name: str) -> SimpleNamespace:
         return gF + strain_adjoint(F, N, h, hencky_adjoint(gl, gq, gA, A, q))
 
     own = vars(base) | {
+        "plain_features": plain_features,
         "features_of": features_of,
         "stress_of": stress_of,
         "stress_coefficients": stress_coefficients,

@@ -37,7 +37,7 @@ INPUTS = 16
 """Columns of the first operand: nine features, a one for the bias, padding."""
 
 
-def _readout(kind: str, name: str) -> SimpleNamespace:
+def readout(kind: str, name: str) -> SimpleNamespace:
     """Return the functions of one particle around the network: features, value, and the adjoints of coefficients and F."""
     if kind == BOUNDED:
         own = bounded_kernels.functions(wp.float32, name)
@@ -45,37 +45,38 @@ def _readout(kind: str, name: str) -> SimpleNamespace:
     own = network_kernels.functions(wp.float32, name)
     if kind == STRESS:
         return SimpleNamespace(**vars(own), value=own.stress_of, coefficients=own.stress_coefficients, gradient=own.stress_gradient)
+    return SimpleNamespace(**vars(own) | vars(correction(own, name)))
+
+
+def correction(own: SimpleNamespace, name: str) -> SimpleNamespace:
+    """Return features, value and adjoints of the correction, from the functions of `network_kernels` or `bounded_kernels`."""
     vec4, mat33, correction_coefficients = own.vec4, own.mat33, own.correction_coefficients
 
     @wp.func(module=name)
     def coefficients(F: mat33, l: float, A: mat33, q: float, c: vec4, scale: float, g: mat33):
         return correction_coefficients(F, l, A, q, c, scale, 0, g)
 
-    return SimpleNamespace(**vars(own), value=own.correction_of, coefficients=coefficients, gradient=own.correction_gradient)
+    features_of = getattr(own, "plain_features", own.features_of)  # those of the bounded law are of a shortened strain
+    return SimpleNamespace(features_of=features_of, value=own.correction_of, coefficients=coefficients, gradient=own.correction_gradient)
 
 
-@cached
-def build(width: int, kind: str) -> SimpleNamespace:
-    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `CORRECTION` or `BOUNDED`."""
-    start_warp()
+def networks(width: int, name: str) -> SimpleNamespace:
+    """Return the functions of a network of one width and their types: its values, its adjoint, and the outputs in what the values keep.
+
+    Args:
+        width: Hidden width, one of `WIDTHS`.
+        name: Name of the Warp module that the functions belong to.
+    """
     tiles = width // 8
     kept = 8 * tiles + 4
     sizes = {
         "H": width, "NT": tiles, "KEPT": kept, "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
         "SIZE3T": tiles * 128,
     }  # fmt: skip
-    name = f"neuido.fused.{width}.{kind}"
-    # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
-    wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
-    own = _readout(kind, name)
-    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
+    vec4 = wp.types.vector(length=4, dtype=wp.float32)
+    vec9 = wp.types.vector(length=9, dtype=wp.float32)
     vecK = wp.types.vector(length=kept, dtype=wp.float32)
-    strain_invariants, features_of = own.strain_invariants, own.features_of
-    value, coefficients, gradient = own.value, own.coefficients, own.gradient
-    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    func = functools.partial(wp.func, module=name)
     floats = wp.array(dtype=wp.float32)
-    ints = wp.array(dtype=wp.int32)
 
     @wp.func_native(FORWARD.format(**sizes))
     def network(x: vec9, shared: int, scene: int, W1: floats, W2: floats, B2: floats, W3: floats, B3: floats) -> vecK: ...
@@ -86,9 +87,28 @@ def build(width: int, kind: str) -> SimpleNamespace:
         warp: int, first: int, last: int, P3: floats, PB: floats, H1: floats, G1: floats, G2: floats,
     ) -> vec9: ...  # fmt: skip
 
-    @func
+    @wp.func(module=name)
     def outputs(k: vecK):
         return vec4(k[wp.static(kept - 4)], k[wp.static(kept - 3)], k[wp.static(kept - 2)], k[wp.static(kept - 1)])
+
+    return SimpleNamespace(network=network, network_adjoint=network_adjoint, outputs=outputs)
+
+
+@cached
+def build(width: int, kind: str) -> SimpleNamespace:
+    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `CORRECTION` or `BOUNDED`."""
+    start_warp()
+    name = f"neuido.fused.{width}.{kind}"
+    # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
+    wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
+    own, layers = readout(kind, name), networks(width, name)
+    vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
+    strain_invariants, features_of = own.strain_invariants, own.features_of
+    value, coefficients, gradient = own.value, own.coefficients, own.gradient
+    network, network_adjoint, outputs = layers.network, layers.network_adjoint, layers.outputs
+    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    floats = wp.array(dtype=wp.float32)
+    ints = wp.array(dtype=wp.int32)
 
     @kernel
     def forward(
@@ -142,7 +162,7 @@ def build(width: int, kind: str) -> SimpleNamespace:
 
 
 @cached(limit=16)
-def _warps(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
+def warps_of(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
     """Return the scene, the first particle and the end of every warp.
 
     The tensors are cached, since nothing may be copied from the host while a graph is captured.
@@ -194,7 +214,7 @@ class FusedEngine(Engine):
         self.first, self.second, self.last = first, second, last
         self.rows = (shared, own)
         self.packed = [t.view(-1) for t in (_fragments(first), _fragments(second), bias, _fragments(last), offset)]
-        self.warps = _warps(particles.offsets, W1.device)
+        self.warps = warps_of(particles.offsets, W1.device)
 
     @property
     def threads(self) -> int:

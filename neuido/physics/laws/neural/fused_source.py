@@ -3,7 +3,8 @@
     m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result,
     and of the next operand the same columns, once the rows of its weights are permuted (`fused._order`).
 
-`FORWARD` and `BACKWARD` are bodies of Warp functions, in which `fused.build` fills in the sizes. On the CPU they do nothing.
+`FORWARD` and `BACKWARD` are bodies of Warp functions, in which `fused.build` fills in the sizes. The CPU, for
+tests, evaluates one particle at a time, without the gradients of the first two layers.
 """
 
 TOOLS = """
@@ -51,6 +52,16 @@ TOOLS = """
     }}
 """
 """The common beginning of both functions: matrix products, residues of operands, and the features as operands."""
+
+PLAIN = """
+    // the CPU evaluates one particle in plain loops, for tests; entry (r, c) of a packed matrix is the sum of its two parts
+    auto entry = [](const wp::array_t<wp::float32>& W, int offset, int columns, int r, int c) {{
+        const float* at = W.data + offset + (((r / 8) * (columns / 8) + c / 8) * 32 + 4 * (c % 8) + (r % 8) / 2) * 4 + r % 2;
+        return at[0] + at[2];
+    }};
+    auto sigmoid = [](float a) {{ return 1.0f / (1.0f + expf(-a)); }};
+"""
+"""The beginning of both functions on the CPU: entries of packed matrices."""
 
 FORWARD = (
     "#if defined(__CUDA_ARCH__)"
@@ -118,8 +129,23 @@ FORWARD = (
         out[{KEPT} - 4 + i] = v + B3.data[scene * 4 + i];
     }}
     return out;
-#else
-    return wp::vec_t<{KEPT}, wp::float32>();
+#else"""
+    + PLAIN
+    + """
+    wp::vec_t<{KEPT}, wp::float32> out;
+    for (int n = 0; n < {H}; ++n) out[n] = B2.data[shared * {H} + n];
+    for (int k = 0; k < {H}; ++k) {{
+        float z = entry(W1, shared * {SIZE1}, {H}, 9, k);
+        for (int i = 0; i < 9; ++i) z += x[i] * entry(W1, shared * {SIZE1}, {H}, i, k);
+        z *= sigmoid(z);
+        for (int n = 0; n < {H}; ++n) out[n] += z * entry(W2, shared * {SIZE2}, {H}, k, n);
+    }}
+    for (int o = 0; o < 4; ++o) {{
+        float y = B3.data[scene * 4 + o];
+        for (int n = 0; n < {H}; ++n) y += out[n] * sigmoid(out[n]) * entry(W3, scene * {SIZE3}, 8, n, o);
+        out[{H} + o] = y;
+    }}
+    return out;
 #endif
 """
 )
@@ -253,8 +279,32 @@ BACKWARD = (
         out[i] = v;
     }}
     return out;
-#else
-    return wp::vec_t<9, wp::float32>();
+#else"""
+    + PLAIN
+    + """
+    float a[{H}], gz[{H}];
+    for (int k = 0; k < {H}; ++k) a[k] = 0.0f;
+    for (int o = 0; o < 4; ++o)
+        if (P3.data) PB.data[warp * 4 + o] += gy[o];
+    for (int n = 0; n < {H}; ++n) {{
+        const float s = sigmoid(kept[n]), h = kept[n] * s;
+        gz[n] = 0.0f;
+        for (int o = 0; o < 4; ++o) {{
+            gz[n] += gy[o] * entry(W3T, scene * {SIZE3T}, {H}, o, n);
+            if (P3.data) P3.data[(warp * {NT} + n / 8) * 32 + 16 * (n % 2) + 4 * o + (n % 8) / 2] += h * gy[o];
+        }}
+        gz[n] *= s + h * (1.0f - s);
+    }}
+    for (int n = 0; n < {H}; ++n)
+        for (int k = 0; k < {H}; ++k) a[k] += gz[n] * entry(W2T, shared * {SIZE2}, {H}, n, k);
+    wp::vec_t<9, wp::float32> out;
+    for (int k = 0; k < {H}; ++k) {{
+        float z = entry(W1, shared * {SIZE1}, {H}, 9, k);
+        for (int i = 0; i < 9; ++i) z += x[i] * entry(W1, shared * {SIZE1}, {H}, i, k);
+        const float s = sigmoid(z), h = z * s;
+        for (int i = 0; i < 9; ++i) out[i] += a[k] * (s + h * (1.0f - s)) * entry(W1T, shared * {SIZE1}, 16, k, i);
+    }}
+    return out;
 #endif
 """
 )

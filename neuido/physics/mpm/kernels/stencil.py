@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
+from neuido.physics.mpm.kernels.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
 
 
 def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:

@@ -201,8 +201,12 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_force: wp.array2d(dtype=real),
         a_friction: wp.array2d(dtype=real),
         parameters: bool,
+        clear: bool,
     ):
-        """Write a_grid; add to the adjoints of gravity, body forces and friction where `parameters` is set."""
+        """Write a_grid; add to the adjoints of gravity, body forces and friction where `parameters` is set.
+
+        `clear` empties a_velocity for the next scatter; only a node with mass has anything there.
+        """
         first = wp.tid() * chunk
         for node in range(first, first + chunk):
             g = grid[node]
@@ -271,6 +275,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                         wp.atomic_add(a_force, s, 4, dt[s] * force[s, 2] * au[1])
                         wp.atomic_add(a_force, s, 5, dt[s] * force[s, 2] * au[2])
                     out = vec4(au[0], au[1], au[2], -wp.dot(au, v0)) / g[3]
+                if clear:
+                    a_velocity[node] = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
             a_grid[node] = out
 
     return SimpleNamespace(

@@ -18,8 +18,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm import grid as grid_functions
-from neuido.physics.mpm import stencil as stencil_functions
+from neuido.physics.mpm.kernels import grid as grid_functions
+from neuido.physics.mpm.kernels import stencil as stencil_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.events import COLLAPSED
 from neuido.physics.runtime.once import cached
