@@ -127,6 +127,22 @@ def test_spin_gives_a_coefficient(tmp_path):
     assert point["magnus.coefficient"] == pytest.approx(0.02, rel=0.15) and fit < 0.045
 
 
+def test_a_hand_that_holds_before_a_throw_is_no_force(tmp_path):
+    """Its first frames say nothing of the velocity, which is far outside of what gravity could make of them."""
+    t, x0, v0 = np.arange(0, 1.0, 1 / 60), np.array([[0.0, 1.2, 0.0]]), np.array([[4.0, 3.0, 0.0]])
+    seen = fly(t, x0, v0, np.array([0.15]), Forces(gravity=(0.0, -9.81, 0.0)))[0][:, :2]
+    seen = seen + 0.004 * np.random.default_rng(0).standard_normal(seen.shape)
+    np.savetxt(tmp_path / "a.csv", np.column_stack([t + 12.3, seen]), delimiter=",", header="t,x,y", comments="")
+    entry = {"name": "a", "body": "ball", "file": "a.csv", "role": "fit", "columns": {"t": "t", "x": "x", "y": "y"}}
+    content = {"format": "neuido-track/1", "name": "throw", "model": {"gravity": [0, -9.81, 0]}, "nuisances": {"release_time": 0.2},
+               "bodies": {"ball": {}}, "recordings": [entry]}  # fmt: skip
+    (tmp_path / "track.yaml").write_text(yaml.safe_dump(content))
+    problem = TrackProblem(read_tracks(tmp_path), "ball")
+    left = problem.predict([{}], 0)[0] - problem.recordings[0].y
+    assert np.sqrt(np.mean(left**2)) < 0.005
+    assert problem.nuisances_of({}, 0)["release_time:a"] == pytest.approx(0.15, abs=0.005)
+
+
 def test_frames_after_the_landing_are_left_out(tmp_path):
     folder = write(tmp_path, {"stone": Forces()}, impact=True)
     tracks = read_tracks(folder)

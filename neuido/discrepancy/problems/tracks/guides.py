@@ -12,6 +12,8 @@ VELOCITY_FRAMES = 4
 """Number of frames for the first estimate of the velocity."""
 NEAR = 0.1
 """Relative standard deviation of the distance of a tracked point from its pivot, about the declared length of the pendulum."""
+BEYOND = 5.0
+"""Half the range of a velocity, in standard deviations of its first estimate, and the same of a displacement that is seen."""
 Values = Mapping[str, np.ndarray]
 """Nuisances of P parameter sets by their names without that of the recording, (P,) each."""
 
@@ -34,6 +36,21 @@ class Guide:
         self.extent = max(float(np.ptp(track.x)), 10 * sigma)
         # noise and acceleration alone change the slope of the first frames by this much
         self.spread = float(np.hypot(2 * sigma / span, max(pull, 1e-3) * span))
+
+    release: float | None = None
+    """Time at which a hand is seen to let go [s]; None where the first frames do not show it."""
+
+    def thrown(self) -> "Guide":
+        """Take the velocity from where the body is seen to move, if a hand held it before and no force explains the change."""
+        moved = np.linalg.norm(self.track.x - np.median(self.track.x[:3], axis=0), axis=1)
+        first = int(np.argmax(moved > BEYOND * self.sigma))
+        rows = slice(first, first + VELOCITY_FRAMES)
+        if first and len(t := self.track.t[rows]) == VELOCITY_FRAMES:
+            slope = np.polyfit(t - t[0], self.track.x[rows], 1)[0]
+            noise = 2 * self.sigma / float(t[-1] - t[0])
+            if np.linalg.norm(slope - self.slope) > BEYOND * noise + self.pull * float(t[0] - self.track.t[0]):
+                self.slope, self.release = slope, float(self.track.t[first - 1])
+        return self
 
     def parameters(self) -> list[Parameter]:
         """Return the parameters that begin a motion."""
@@ -62,7 +79,7 @@ class Guide:
 
     def speed(self, name: str, at: float) -> Parameter:
         """Return the parameter of a velocity, in the unit of the data per second."""
-        low, high = at - 5 * self.spread, at + 5 * self.spread
+        low, high = at - BEYOND * self.spread, at + BEYOND * self.spread
         return Parameter(f"{name}:{self.track.name}", f"{self.unit}/s", at, self.spread / 4, low, high, prior=4.0)
 
     @property
@@ -149,7 +166,7 @@ class Swinging(Guide):
         rate, spread = float(np.polyfit(self.track.t[:n], angle[:n], 1)[0]), self.spread / radius
         step = max(3 * self.sigma, 1e-3 * self.extent)
         out = [Parameter(f"angle:{name}", "rad", float(np.median(angle[:3])), step / radius, float(angle[0]) - 1.0, float(angle[0]) + 1.0)]
-        out += [Parameter(f"rate:{name}", "rad/s", rate, spread / 4, rate - 5 * spread, rate + 5 * spread, prior=4.0)]
+        out += [Parameter(f"rate:{name}", "rad/s", rate, spread / 4, rate - BEYOND * spread, rate + BEYOND * spread, prior=4.0)]
         for key, at in zip("lu", pivot):
             label = "pivot_level" if key == "l" else "pivot_up"
             out.append(Parameter(f"{label}:{name}", "m", float(at), step, float(at) - self.length, float(at) + self.length))
@@ -200,7 +217,7 @@ def guide_of(track: Track, constraint: Constraint | None, sigma: float, gravity:
         return Turning(track, sigma, float(np.ptp(track.x)) / max(float(np.ptp(track.t)), 1e-9) ** 2)
     if kind == "plane":
         return Rolling(track, sigma, size, normal_of(constraint, gravity))
-    return Guide(track, sigma, size)
+    return Guide(track, sigma, size).thrown()
 
 
 def normal_of(constraint: Constraint | None, gravity: Sequence[float]) -> np.ndarray:

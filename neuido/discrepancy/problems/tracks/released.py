@@ -131,7 +131,7 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     """Fit the nuisances of a recording to its first frames, for P models at once.
 
     The fit is least squares with the priors, weighted by the tracking error (Levenberg-Marquardt). It starts from the centre of the
-    priors and from a release one standard deviation later, and the better result counts.
+    priors and from a release where a hand is seen to let go, or one standard deviation later, and the better result counts.
 
     Args:
         start: The recording.
@@ -146,7 +146,8 @@ def settle(start: Released, forces: Forces, count: int, frames: int) -> np.ndarr
     t, y = track.t[:frames], track.x[:frames]
     scale, centre, low, high = (np.array([getattr(p, key) for p in parameters]) for key in ("scale", "value", "lower", "upper"))
     release = [i for i, p in enumerate(parameters) if p.name.startswith("release_time")]
-    begun = [centre, centre + np.array([(p.prior or 0.0) * p.scale if i in release else 0.0 for i, p in enumerate(parameters)])]
+    later = [(p.prior or 0.0) * p.scale if start.guide.release is None else start.guide.release for p in parameters]
+    begun = [centre, centre + np.array([later[i] if i in release else 0.0 for i in range(len(parameters))])]
     begun = begun if release else begun[:1]
     values = np.repeat(np.clip(begun, low, high), count, axis=0)
     rows, k = values.shape
