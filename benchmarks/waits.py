@@ -32,7 +32,7 @@ from parts import Row, operations, parts
 
 from neuido.commands.main import main as command
 from neuido.data.scenes.film_options import Film
-from neuido.models.render.splatting import rasterize
+from neuido.models.render import splatting
 
 ROOT = Path(__file__).parents[1]
 
@@ -112,7 +112,9 @@ class Bench:
                 "body": {"shape": "ball", "centre": [0.5, 0.35, 0.5], "radius": 0.25, "spacing": self.size.spacing, "jitter": 0.5,
                          "velocity": [0.1 * i, -1.9, 0.0]},
             })  # fmt: skip
-        folders = make_scenes(entries, self.size.film, self.folder / "scenes", draw=rasterize, device=self.device.type, progress=False)
+        folders = make_scenes(
+            entries, self.size.film, self.folder / "scenes", draw=splatting.rasterize, device=self.device.type, progress=False
+        )
         for folder in folders:
             truth, own = read_truth(folder), folder / "reconstruction"
             assert truth is not None
@@ -223,7 +225,8 @@ def pictures(bench: Bench) -> list[Row]:
             times = bench.times(functools.partial(draw, gradient), bench.options.repeat)
             rows.append(Row(f"{name}, {way}", statistics.median(times), len(times)))
         if bench.device.type == "cuda":
-            run = functools.partial(draw, True, capacity=60 * gaussians)
+            longest = max(room for size, room in splatting._rooms.items() if size[2] == gaussians)
+            run = functools.partial(draw, True, capacity=longest)
             run()
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
@@ -242,7 +245,7 @@ def picture(tensors: list[torch.Tensor], pixels: int) -> Callable[..., None]:
     def draw(gradient: bool, **options: Any) -> None:
         for leaf in leaves:
             leaf.requires_grad_(gradient)
-        shown = rasterize(*tensors, pixels, pixels, **options)[0]
+        shown = splatting.rasterize(*tensors, pixels, pixels, **options)[0]
         if gradient:
             torch.autograd.grad(shown, leaves, weight)
 

@@ -5,17 +5,17 @@ Colours are independent of the viewing direction (spherical harmonics of degree 
 """
 
 import math
-from typing import Any, cast
+from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor, nn
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from neuido.data.files.renamed_options import renamed_options
 from neuido.errors import UserError
 from neuido.models.reconstruct.filling import LEVEL, Volume, visual_hull
 from neuido.models.render.gaussians import covariances_of, harmonics_of
+from neuido.models.render.similarity import structural_similarity
 from neuido.models.render.splatting import rasterize
 from neuido.types import Cameras, Gaussians, MultiViewBatch, Vector
 
@@ -172,7 +172,7 @@ class ReconstructModule(LightningModule):
         images, alphas = self.render(chosen, self.batch.background)
         one, other = images.permute(0, 3, 1, 2), truth.permute(0, 3, 1, 2)
         difference, outline = (images - truth).abs().mean(), (alphas - masks).abs().mean()
-        similarity = cast(Tensor, structural_similarity_index_measure(one, other, data_range=1.0))  # a pair only with an image of it
+        similarity = structural_similarity(one, other).mean()
         loss = (1 - self.hparams.ssim) * difference + self.hparams.ssim * (1 - similarity) + self.hparams.silhouette * outline
         if here % self.trainer.log_every_n_steps == 0:
             square = (images.detach() - truth).square().mean()
