@@ -1,5 +1,6 @@
 """Settings of all tests: two cores, a quiet Warp, the data root, and `gpu` tests only where there is a device."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import warp as wp
 
 torch.set_num_threads(1)
 wp.config.log_level = wp.LOG_WARNING
+
+gc.disable()  # what collection makes stays until the end: to search it for garbage again and again took a tenth of the time
 
 
 def pytest_configure(config):
@@ -25,6 +28,11 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "gpu" in item.keywords:
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+def pytest_collection_finish():
+    gc.freeze()  # leaves modules and tests out of every later search
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

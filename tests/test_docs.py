@@ -1,14 +1,18 @@
 """The documentation: its snippets run, its commands are known to the command line, its links hold, its schemas agree with the readers."""
 
 import ast
+import contextlib
 import copy
+import functools
 import importlib.util
+import io
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -95,17 +99,28 @@ def test_api_example(name, tmp_path, monkeypatch):
     exec(compile(api_examples()[name], f"example of {name}", "exec"), {})
 
 
+@pytest.fixture(scope="module")
+def help_of() -> Callable[[str], str]:
+    """Return the help of a light command, printed once for all pages."""
+
+    @functools.cache
+    def printed(name: str) -> str:
+        with pytest.raises(SystemExit), contextlib.redirect_stdout(io.StringIO()) as out:
+            cli.main([name, "--help"])
+        return out.getvalue()
+
+    return printed
+
+
 @pytest.mark.parametrize(("page", "command"), commands())
-def test_command_is_known(page, command, capsys):
+def test_command_is_known(page, command, help_of):
     name, *args = shlex.split(command)[1:]
     assert name in cli.LIGHT or name in cli.HEAVY, f"{page}: {command}"
     configs = [args[i + 1] for i, word in enumerate(args[:-1]) if word == "--config"]
     for config in configs:
         assert (ROOT / config).is_file() or list((ROOT / "configs").rglob(f"{config}*")), f"{page}: {config}"
     if name in cli.LIGHT:
-        with pytest.raises(SystemExit):
-            cli.main([name, "--help"])
-        known = capsys.readouterr().out
+        known = help_of(name)
         for word in args:
             if word.startswith("--"):
                 assert word in known, f"{page}: {command}"
