@@ -352,7 +352,7 @@ def test_stored_predictions_are_of_the_code_that_made_them(tmp_path, monkeypatch
     for name in ("errors.py", "types.py", "physics/law.py", "data/read.py", "models/a.py", "discrepancy/a.py"):
         (package / name).parent.mkdir(parents=True, exist_ok=True)
         (package / name).write_text("a = 1\n")
-    monkeypatch.setattr(store.neuido, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(store, "__file__", str(package / "discrepancy" / "store.py"))
     digests = []
     for text in ("a = 1\n", "a = 2\n"):
         (package / "physics" / "law.py").write_text(text)

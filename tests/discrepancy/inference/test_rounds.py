@@ -38,6 +38,8 @@ T = np.linspace(0.0, 1.0, 120)
 NOISE = 0.01
 WAVES = 3
 WAVE = np.array([[np.sin((k + 1 + 0.3 * n) * T) for k in range(8)] for n in range(WAVES)])
+SIZES = [[f"wave{n}.c{k}" for k in range(8)] for n in range(WAVES)]
+SQUARE, CUBE = T**2, T**3
 
 
 class Line(Problem):
@@ -74,12 +76,16 @@ class Line(Problem):
     def predict(self, points, recording, setting=0):
         out = []
         for p in points:
-            phase = 3.0 * p.get("a", 1.0) if self._turns else 0.0
-            y = (p.get("a", 1.0) + 2.0 * setting) * T + self._wiggle * setting * np.sin(40 * T + phase)
-            for n in range(WAVES):
-                if any(f"wave{n}.c{k}" in p for k in range(8)):
-                    y = y + sum(p.get(f"wave{n}.c{k}", 0.0) * WAVE[n, k] for k in range(8))
-            y = y + p.get("square.c", 0.0) * T**2 + p.get("cube.c", 0.0) * T**3
+            y = (p.get("a", 1.0) + 2.0 * setting) * T
+            if setting:
+                phase = 3.0 * p.get("a", 1.0) if self._turns else 0.0
+                y = y + self._wiggle * setting * np.sin(40 * T + phase)
+            for names, wave in zip(SIZES, WAVE):
+                if sizes := [(size, row) for name, row in zip(names, wave) if (size := p.get(name, 0.0))]:
+                    y = y + sum(size * row for size, row in sizes)
+            for name, power in (("square.c", SQUARE), ("cube.c", CUBE)):
+                if size := p.get(name, 0.0):
+                    y = y + size * power
             out.append(np.minimum(y, 1.0 / p["clip.inverse"]) if p.get("clip.inverse") else y)
         return np.stack(out)
 
