@@ -30,11 +30,13 @@ from neuido.data.bodies.shapes import ball
 from neuido.data.files.writing import write_text
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.laws.classical import FixedCorotated
+from neuido.physics.mpm import passes
+from neuido.physics.mpm.kernels.tile_source import ROLLED, UNROLLED
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Scene, Walls
 
-CHOICES = ("separate", "transfers", "fused")
-"""Values of `fusion`, the twin first."""
+CHOICES = ("separate", "transfers", "transfers-rolled", "fused", "fused-rolled")
+"""Values of `fusion`, the twin first; `rolled`: with loops over the nodes that are not written out, less code to fetch."""
 
 
 @dataclass
@@ -117,7 +119,8 @@ def kernel_times(run: Callable[[], object], steps: int) -> dict[str, float]:
 def prepared(case: Case, fusion: str, device: torch.device) -> tuple[Simulator, int, Callable[[], tuple[list, list]]]:
     """Return the simulator and the substeps of a case, and a function that returns its motion and its gradients."""
     scenes, made, steps, laws = case.make()
-    sim = Simulator(scenes, made, device=device, fusion=fusion)
+    passes.TURNS = ROLLED if fusion.endswith("rolled") else UNROLLED
+    sim = Simulator(scenes, made, device=device, fusion=fusion.removesuffix("-rolled"))
     elastic, plastic, leaves = laws()
     weight = torch.randn(len(sim.mass), 3, generator=torch.Generator().manual_seed(1)).to(device)
     every = 5 if steps % 5 == 0 else 1

@@ -15,18 +15,19 @@ from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(real: type, corrects: bool) -> SimpleNamespace:
+def build(real: type, corrects: bool, turns: int) -> SimpleNamespace:
     """Return the kernels `advance` and `retreat`, as `network_pass` has them.
 
     Args:
         real: `wp.float32` or `wp.float64`.
         corrects: Whether there is a plastic law.
+        turns: As for `particle_functions.functions`.
     """
     start_warp()
-    name = f"neuido.substep.{real.__name__}.{'corrected' if corrects else 'elastic'}"
+    name = f"neuido.substep.{real.__name__}.{'corrected' if corrects else 'elastic'}.{turns}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
-    law, move = classical_kernels.kernels(real).functions, particle_functions.functions(real, name)
+    law, move = classical_kernels.kernels(real).functions, particle_functions.functions(real, name, turns)
     stress_of, stress_gradient, correct, correction_gradient = law
     gather, watch, scatter, warp_sum = move.gather, move.watch, move.scatter, move.warp_sum
     gather_adjoint, scatter_adjoint = move.gather_adjoint, move.scatter_adjoint

@@ -15,20 +15,21 @@ from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(width: int, kind: str, corrects: bool) -> SimpleNamespace:
+def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
     """Return the kernels `advance` and `retreat`.
 
     Args:
         width: Hidden width of both networks, one of `fused.WIDTHS`.
         kind: Read-out of the elastic law, `fused.STRESS` or `fused.BOUNDED`.
         corrects: Whether there is a plastic law.
+        turns: As for `particle_functions.functions`.
     """
     start_warp()
-    name = f"neuido.substep.{width}.{kind}.{'corrected' if corrects else 'elastic'}"
+    name = f"neuido.substep.{width}.{kind}.{'corrected' if corrects else 'elastic'}.{turns}"
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))  # as in `fused`
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
-    own, layers, move = fused.readout(kind, name), fused.networks(width, name), particle_functions.functions(wp.float32, name)
+    own, layers, move = fused.readout(kind, name), fused.networks(width, name), particle_functions.functions(wp.float32, name, turns)
     strain_invariants, features_of, stress_of = own.strain_invariants, own.features_of, own.value
     stress_coefficients, stress_gradient = own.coefficients, own.gradient
     network, network_adjoint, outputs = layers.network, layers.network_adjoint, layers.outputs

@@ -12,11 +12,15 @@ from neuido.physics.laws.neural import fused
 from neuido.physics.laws.parametric import ParametricLaw
 from neuido.physics.mpm import classical_pass, network_pass
 from neuido.physics.mpm.kernels import transfer_pass
+from neuido.physics.mpm.kernels.tile_source import UNROLLED
 from neuido.physics.mpm.plan import FIXED, LARGE, STATES, Plan
 from neuido.physics.runtime.device import real_of
 
 VISCOSITY = STATES + 4
 """Index of the input of viscous stress."""
+
+TURNS = UNROLLED
+"""Turns of the loops over nodes that are written out."""
 
 BY_DEFAULT: dict[str, str] = {}
 """The kernels that `fusion="auto"` takes on each type of device; `separate` on others."""
@@ -169,7 +173,7 @@ class TransferPass(Pass):
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         super().__init__(plan, inputs)
         self.elastic, self.plastic = plan.engines(inputs)
-        self.kernels = transfer_pass.build(real_of(plan.setup.dtype))
+        self.kernels = transfer_pass.build(real_of(plan.setup.dtype), TURNS)
         self.block = 32 if len(plan.setup.mass) < LARGE else 128
         self.spare = [torch.empty_like(plan.setup.state.F) for _ in range(2)]
 
@@ -216,7 +220,7 @@ class NetworkPass(Pass):
         elastic, plastic = plan.elasticity, plan.plasticity
         self.elastic = fused.FusedEngine(elastic, inputs[FIXED : plan.split], particles)
         self.plastic = None if plastic is None else fused.FusedEngine(plastic, inputs[plan.split :], particles)
-        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, self.corrects)  # type: ignore[attr-defined]
+        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, self.corrects, TURNS)  # type: ignore[attr-defined]
 
     def _packed(self, engine: fused.FusedEngine | None) -> list:
         if engine is None:
@@ -245,7 +249,7 @@ class ClassicalPass(Pass):
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         super().__init__(plan, inputs)
         self.elastic, self.plastic = plan.engines(inputs)
-        self.kernels = classical_pass.build(real_of(plan.setup.dtype), self.corrects)
+        self.kernels = classical_pass.build(real_of(plan.setup.dtype), self.corrects, TURNS)
         self.block = 32 if len(plan.setup.mass) < LARGE else 128
 
     def _law(self, engine: Engine | None) -> list:

@@ -13,12 +13,13 @@ from neuido.physics.mpm.kernels.transfers import FAST, LOST
 from neuido.physics.runtime.events import COLLAPSED
 
 
-def functions(real: type, name: str) -> SimpleNamespace:
+def functions(real: type, name: str, turns: int) -> SimpleNamespace:
     """Return the functions for one scalar type.
 
     Args:
         real: `wp.float32`, with sums by the source of `tile_source`, or `wp.float64`, with plain ones.
         name: Name of the Warp module that the functions belong to.
+        turns: Turns of loops that are written out, `tile_source.ROLLED` or `tile_source.UNROLLED`.
     """
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -34,10 +35,10 @@ def functions(real: type, name: str) -> SimpleNamespace:
         @wp.func_native(tile_source.LOAD4)
         def load4(a: wp.array(dtype=vec4), i: int) -> vec4: ...
 
-        @wp.func_native(tile_source.GATHER4)
+        @wp.func_native(tile_source.unrolled(tile_source.GATHER4, turns))
         def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...
 
-        @wp.func_native(tile_source.SPREAD_TILE)
+        @wp.func_native(tile_source.unrolled(tile_source.SPREAD_TILE, turns))
         def spread(
             grid: wp.array(dtype=vec4), nx: int, ny: int, nz: int, size_y: int, size_z: int, wx: vec3, wy: vec3, wz: vec3,
             b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, live: int,

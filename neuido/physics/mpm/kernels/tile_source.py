@@ -8,6 +8,9 @@ tile needs no atomics. A warp whose particles are too far apart adds to the grid
 On the CPU a particle adds to the grid by itself.
 """
 
+ROLLED, UNROLLED = 1, 9
+"""Turns of the loops over nodes that are written out: less code to fetch, or fewer instructions."""
+
 CAPACITY = 512
 """Nodes of a tile; 8 KB a warp. A warp that begins at the end of one row of cells and ends at the beginning of the next needs about 400."""
 
@@ -29,8 +32,9 @@ GATHER4 = """
         return lanes(u.x, u.y, u.z);
     };
     lanes v = {}, vx = {}, vy = {}, vz = {};
-    #pragma unroll
+    #pragma unroll UNROLL
     for (int i = 0; i < 3; ++i) {
+        const float wi = i == 0 ? wx[0] : i == 1 ? wx[1] : wx[2];
         lanes u = {}, uy = {}, uz = {};
         #pragma unroll
         for (int j = 0; j < 3; ++j) {
@@ -41,10 +45,10 @@ GATHER4 = """
             if (j) uy += (j * wy[j]) * uj;
             uz += wy[j] * (wz[1] * u1 + (2.0f * wz[2]) * u2);
         }
-        v += wx[i] * u;
-        if (i) vx += (i * wx[i]) * u;
-        vy += wx[i] * uy;
-        vz += wx[i] * uz;
+        v += wi * u;
+        vx += (i * wi) * u;
+        vy += wi * uy;
+        vz += wi * uz;
     }
     wp::mat_t<4, 3, float> out;
     #pragma unroll
@@ -134,44 +138,38 @@ SPREAD_TILE = """
     const int longest = __reduce_max_sync(full, here ? left : 0);
     const bool adds = head && here;
     __syncwarp();
-    float pi[3] = {first[0], first[1], first[2]};
-    #pragma unroll
-    for (int i = 0; i < 3; ++i) {
-        float pj[3] = {pi[0], pi[1], pi[2]};
+    #pragma unroll UNROLL
+    for (int ij = 0; ij < 9; ++ij) {
+        const int i = ij / 3, j = ij - 3 * i;
+        const float wij = (i == 0 ? wgt[0] : i == 1 ? wgt[1] : wgt[2]) * (j == 0 ? wgt[3] : j == 1 ? wgt[4] : wgt[5]);
+        const int row = own + i * step_x + j * step_y;
+        float q[3];
         #pragma unroll
-        for (int j = 0; j < 3; ++j) {
-            float pk[3] = {pj[0], pj[1], pj[2]};
-            const float wij = wgt[i] * wgt[3 + j];
-            const int row = own + i * step_x + j * step_y;
-            #pragma unroll
-            for (int k = 0; k < 3; ++k) {
-                const float w = wij * wgt[6 + k];
-                float v[4] = {w * pk[0], w * pk[1], w * pk[2], w * first[3]};
-                for (int e = 1; e <= longest; e *= 2) {
-                    #pragma unroll
-                    for (int c = 0; c < 4; ++c) {
-                        const float u = __shfl_down_sync(full, v[c], e);
-                        if (e <= left) v[c] += u;
-                    }
-                }
-                if (fits) {
-                    if (adds) {
-                        float4 sum = tile[row + k];
-                        sum.x += v[0]; sum.y += v[1]; sum.z += v[2]; sum.w += v[3];
-                        tile[row + k] = sum;
-                    }
-                    __syncwarp();
-                } else if (adds) {
-                    %(add)s
-                }
+        for (int c = 0; c < 3; ++c) q[c] = first[c] + i * grow[c] + j * grow[3 + c];
+        #pragma unroll
+        for (int k = 0; k < 3; ++k) {
+            const float w = wij * wgt[6 + k];
+            float v[4] = {w * q[0], w * q[1], w * q[2], w * first[3]};
+            for (int e = 1; e <= longest; e *= 2) {
                 #pragma unroll
-                for (int c = 0; c < 3; ++c) pk[c] += grow[6 + c];
+                for (int c = 0; c < 4; ++c) {
+                    const float u = __shfl_down_sync(full, v[c], e);
+                    if (e <= left) v[c] += u;
+                }
+            }
+            if (fits) {
+                if (adds) {
+                    float4 sum = tile[row + k];
+                    sum.x += v[0]; sum.y += v[1]; sum.z += v[2]; sum.w += v[3];
+                    tile[row + k] = sum;
+                }
+                __syncwarp();
+            } else if (adds) {
+                %(add)s
             }
             #pragma unroll
-            for (int c = 0; c < 3; ++c) pj[c] += grow[3 + c];
+            for (int c = 0; c < 3; ++c) q[c] += grow[6 + c];
         }
-        #pragma unroll
-        for (int c = 0; c < 3; ++c) pi[c] += grow[c];
     }
     for (int t = lane; t < count; t += 32) {
         const float4 sum = tile[t];
@@ -224,3 +222,8 @@ WARP_SUM = """
 #endif
 """
 """Return the sum over the warp in its first lane and zero in the others; on the CPU the value itself."""
+
+
+def unrolled(source: str, turns: int) -> str:
+    """Return `GATHER4` or `SPREAD_TILE` with that many turns of its outer loop written out, `ROLLED` or `UNROLLED`."""
+    return source.replace("UNROLL", str(turns))

@@ -11,12 +11,12 @@ from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(real: type) -> SimpleNamespace:
+def build(real: type, turns: int) -> SimpleNamespace:
     """Return the kernels `pull` (G2P and the trial gradient), `push` (P2G) and their adjoints, for one scalar type."""
     start_warp()
-    name = f"neuido.substep.{real.__name__}.transfers"
+    name = f"neuido.substep.{real.__name__}.transfers.{turns}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
-    move = particle_functions.functions(real, name)
+    move = particle_functions.functions(real, name, turns)
     gather, watch, scatter = move.gather, move.watch, move.scatter
     gather_adjoint, scatter_adjoint = move.gather_adjoint, move.scatter_adjoint
     reals, ints, held_type = wp.array(dtype=real), wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
