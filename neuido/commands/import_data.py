@@ -65,7 +65,7 @@ def import_data(
         files: Files, one a recording; text of any dialect, xlsx, xls, trc, c3d, h5 or video (mp4, mov, avi, mkv). A table of several
             specimens is several tests. Of a scene one, and after it the body where the scene has none: a mesh or Gaussians.
         out: Folder to write, which must not be there.
-        kind: auto, material (a testing machine), track (a body as one point), body (points on a deforming body),
+        kind: auto, material (a testing machine), track (a body as one point), body (points on a deforming body, or its outline in a video),
             field (displacements by digital image correlation) or scene (of another program).
         mode: Of a material test: uniaxial, compression, equibiaxial, pure_shear, biaxial or simple_shear.
         columns: Quantity and title, where titles do not say it: --columns.force "Channel 2".
@@ -73,7 +73,8 @@ def import_data(
         strain_unit: Unit of the strain: percent, or a ratio such as mm/mm.
         length: Gauge length of the specimen, or of a pendulum from the pivot to its centre of mass, with the unit, as "50 mm".
         width: Its width, with a unit.
-        thickness: Its thickness, with a unit.
+        thickness: Its thickness, with a unit; of an outline, the depth of the body along the line of sight. A body of revolution about the
+            vertical axis where absent.
         section_diameter: Of a round specimen, with a unit.
         area: Cross-section in place of width, thickness and diameter, as "20 mm^2".
         compression: Whether the table counts compression as positive. In mode compression the signs are found.
@@ -97,7 +98,8 @@ def import_data(
         mass: Of the body in kg.
         diameter: Of the body in m; of a video without --scale, it gives the scale.
         volume: Of a deforming body in m^3; the hull of the first frame where absent.
-        floor: Height of a floor in m; of a body that bounces, that of the tracked point when it touches.
+        floor: Height of a floor in m; of a body that bounces, that of the tracked point when it touches; of an
+            outline, above the lower edge of the picture.
         guide: What guides the body of a track: none (it flies), pendulum, spring, axis, plane or bounce.
         stiffness: Of a spring in N/m, or of an axis per moment of inertia in 1/s^2; a rough value.
         inertia: Of a body on a plane, its moment of inertia over m r^2: 0.4 of a solid ball that rolls, 0 of what slides.

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -83,7 +84,44 @@ def write_deforming_body(
         spacings.append(body.spacing)
         low.append(np.minimum(np.nanmin(x, axis=(0, 1)), body.x0.min(axis=0)))
         high.append(np.maximum(np.nanmax(x, axis=(0, 1)), body.x0.max(axis=0)))
-    lower, upper = np.min(low, axis=0), np.max(high, axis=0)
+    recordings = [
+        {"name": name, "role": roles[name], "frame_interval": float(np.median(np.diff(take["t"])))} for name, take in arrays.items()
+    ]
+    lower, upper, spacing = np.min(low, axis=0), np.max(high, axis=0), float(np.median(spacings))
+    content, notes = declared_content(next(iter(takes)), lower, upper, spacing, density, young, poisson, floor, recordings)
+    summary += notes
+
+    def fill(folder: Path) -> None:
+        for name, take in arrays.items():
+            write_arrays(folder / name / "particles.npz", take)
+        write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+
+    return summary + write_checked(out, fill, read_experiment)
+
+
+def declared_content(
+    name: str,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    spacing: float,
+    density: float,
+    young: float,
+    poisson: float | None,
+    floor: float | None,
+    recordings: list[dict[str, Any]],
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the content of experiment.yaml for a body of which only rough values are known, and what was assumed, for the summary.
+
+    Args:
+        name: Name of the experiment.
+        lower, upper: Corners of what the body passes through [m], (3,) each.
+        spacing: Distance of neighbouring particles [m].
+        density: Declared density [kg/m^3].
+        young: Declared Young's modulus [Pa].
+        poisson: Declared Poisson's ratio; 0.3 if None.
+        floor: Height of the floor [m]; None: there is no floor.
+        recordings: The entries of the recordings.
+    """
     size = float((upper - lower).max())
     lower, upper = lower - 0.15 * size, upper + 0.15 * size
     colliders = []
@@ -93,36 +131,28 @@ def write_deforming_body(
             {"type": "plane", "point": [0.0, float(floor), 0.0], "normal": [0.0, 1.0, 0.0], "contact": "separate", "friction": 0.0}
         ]
     longest = float((upper - lower).max())
-    cells = int(np.clip(round(longest / (CELL * float(np.median(spacings)))), *CELLS))
+    cells = int(np.clip(round(longest / (CELL * spacing)), *CELLS))
     wave = np.sqrt(young / density)
     dt = float(f"{min(0.2 * longest / cells / wave, 1e-3):.1g}")
     elasticity = {"law": "fixed_corotated", "young": float(young), "poisson": 0.3 if poisson is None else poisson}
     content = {
         "format": "neuido-experiment/1",
-        "name": next(iter(takes)),
+        "name": name,
         "scene": {"domain": [lower.tolist(), upper.tolist()], "gravity": [0.0, -9.81, 0.0], "colliders": colliders},
         "model": {"density": float(density), "elasticity": elasticity, "plasticity": {"law": "identity"}, "free": ["young"]},
         "discretisation": {"grid": cells, "dt": dt},
-        "recordings": [
-            {"name": name, "role": roles[name], "frame_interval": float(np.median(np.diff(take["t"])))} for name, take in arrays.items()
-        ],
+        "recordings": recordings,
     }
-    summary += [
+    notes = [
         f"model: fixed corotated elasticity, Young's modulus {young:g} Pa (fitted), density {density:g} kg/m^3, Poisson's ratio "
         f"{elasticity['poisson']:g}{'' if poisson is not None else ' (assumed: --poisson)'}, no plasticity",
         "gravity 9.81 m/s^2 along -y (--up z where z points up); "
         + (f"floor at y = {floor:g} m" if floor is not None else "no floor (--floor HEIGHT adds one)"),
         f"grid of {cells} cells of {1e3 * longest / cells:.3g} mm, steps of {1e3 * dt:g} ms",
     ]
-    if len(takes) == 1:
-        summary.append("one recording, so that none is held out: a second file would test the answer")
-
-    def fill(folder: Path) -> None:
-        for name, take in arrays.items():
-            write_arrays(folder / name / "particles.npz", take)
-        write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
-
-    return summary + write_checked(out, fill, read_experiment)
+    if len(recordings) == 1:
+        notes.append("one recording, so that none is held out: a second file would test the answer")
+    return content, notes
 
 
 def start_velocity(t: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, str]:

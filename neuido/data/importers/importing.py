@@ -21,6 +21,7 @@ from neuido.data.importers.plain_motion import Motion
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of
 from neuido.data.importers.tables.titled_tables import read_cells, read_titled
 from neuido.data.importers.tables.titles import find_columns, named_points
+from neuido.data.importers.tables.units import parse_quantity
 from neuido.data.importers.track_folder import Axes, RecordedMotion, in_si, write_tracks
 from neuido.data.importers.tracker_exports import layout_of_rows, read_motions
 from neuido.errors import UserError
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 KINDS = ("auto", "material", "track", "body", "field")
 WHAT = {"material": "a material test", "track": "a motion", "body": "points on a deforming body", "field": "a full field",
-        "film": "a video", "views": "clips of several cameras (--cameras)"}  # fmt: skip
+        "film": "a video", "outlines": "an outline (--kind body)", "views": "clips of several cameras (--cameras)"}  # fmt: skip
 """What the data of each kind are called in messages."""
 
 
@@ -108,8 +109,9 @@ def import_file(
     films = [path for path in paths if is_video(path)]
     if films and len(films) < len(paths):
         raise UserError(f"{films[0].name} is a video and {next(p for p in paths if p not in films).name} is not: import them one by one")
-    if films and kind not in ("auto", "track"):
+    if films and kind not in ("auto", "track", "body"):
         raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
+    outlines = films and kind == "body" and filming.cameras is None
     with naming(paths[0]):
         chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
     guided = {key: value for key, value in guide._asdict().items() if value is not None and value != "none"}
@@ -119,20 +121,21 @@ def import_file(
     several = {key: filmed.pop(key) for key in ("board", "synchronise", "offsets")}
     _check_options(
         paths[0].name,
-        "views" if films and filming.cameras is not None else "film" if films else chosen,
-        (("film", "views", "track", "body"), {"scale": scale, "frame_rate": frame_rate}),
+        "views" if films and filming.cameras is not None else "outlines" if outlines else "film" if films else chosen,
+        (("film", "outlines", "views", "track", "body"), {"scale": scale, "frame_rate": frame_rate}),
         (("film", "track", "body"), {"y_down": y_down, "point": point, "mass": mass, "diameter": diameter}),
         (("body",), {"volume": volume}),
-        (("views", "body", "track", "film"), {"floor": floor}),
+        (("views", "body", "outlines", "track", "film"), {"floor": floor}),
         (("track", "film"), {"guide": guided.pop("type", None), **guided}),
-        (("material", "field", "body"), {"density": density, "young": young, "poisson": poisson}),
+        (("material", "field", "outlines", "body"), {"density": density, "young": young, "poisson": poisson}),
         (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
                          **(preparation or Preparation()).changed()}),
+        (("material", "field", "outlines"), {"thickness": dimensions.pop("thickness")}),
         (("material", "field"), {key: value for key, value in dimensions.items() if key != "length"}),
         (("material", "field", "track", "film"), {"length": shared or dimensions["length"]}),
-        (("material", "film", "views", "track", "body"), {"held_out": held_out or None}),
+        (("material", "film", "outlines", "views", "track", "body"), {"held_out": held_out or None}),
         (("field",), {"forces": forces, "region": region}),
-        (("film", "views"), filmed),
+        (("film", "outlines", "views"), filmed),
         (("views",), several),
     )  # fmt: skip
     if films:
@@ -146,6 +149,26 @@ def import_file(
                 files_by_name, out, filming, contact, held_out=held_out, scale=scale, up=up, floor=floor, frame_rate=frame_rate
             )
             return summary + _contact_sheet(contact, filming)
+    if outlines:
+        from neuido.data.importers.filmed_body import write_filmed_body
+
+        assert contact is not None
+        thickness = None if specimen is None else specimen.thickness
+        summary = write_filmed_body(
+            files_by_name,
+            out,
+            filming,
+            contact,
+            roles=roles_of(list(files_by_name), held_out),
+            scale=scale,
+            thickness=None if thickness is None else parse_quantity(thickness, "m", "thickness"),
+            density=density,
+            young=young,
+            poisson=poisson,
+            floor=floor,
+            frame_rate=frame_rate,
+        )
+        return summary + _contact_sheet(contact, filming) + _next_commands(out)
 
     def read(path: Path) -> dict[str, RecordedMotion]:
         if contact is None:
@@ -214,11 +237,7 @@ def import_file(
                 )
         if len(takes) > 1:
             summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out')} (--held_out NAMES)")
-    summary += _contact_sheet(contact, filming)
-    if out is not None:
-        folder, answer = shlex.quote(str(out)), shlex.quote(f"{out}-answer")
-        summary.append(f"next: neuido check {folder}; neuido diagnose {folder} --out {answer}")
-    return said + summary
+    return said + summary + _contact_sheet(contact, filming) + _next_commands(out)
 
 
 def _check_options(name: str, chosen: str, *groups: tuple[tuple[str, ...], Mapping[str, object]]) -> None:
@@ -235,6 +254,13 @@ def _check_options(name: str, chosen: str, *groups: tuple[tuple[str, ...], Mappi
             others = " or ".join(dict.fromkeys(WHAT[kind] for kind in kinds))
             other = "" if chosen in ("film", "views") else ", or give --kind"
             raise UserError(f"--{wrong} is for {others}, and {name} holds {WHAT[chosen]}: leave it out{other}")
+
+
+def _next_commands(out: str | os.PathLike | None) -> list[str]:
+    if out is None:
+        return []
+    folder, answer = shlex.quote(str(out)), shlex.quote(f"{out}-answer")
+    return [f"next: neuido check {folder}; neuido diagnose {folder} --out {answer}"]
 
 
 def _contact_sheet(contact: "Sheet | None", filming: Filming) -> list[str]:

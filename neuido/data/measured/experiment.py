@@ -232,6 +232,9 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
     if (own / "particles.npz").is_file():
         fields = _particles(own / "particles.npz", scene, interval)
         _check_boxes(scene, fields["body"].x, where)
+    elif (own / "body.npz").is_file():
+        fields["body"] = _body(own / "body.npz", scene)
+        _check_boxes(scene, fields["body"].x, where)
     if (own / "transforms.json").is_file():
         fields["video"] = nerfstudio.read(own)
     gaussians = own / "gaussians.ply"
@@ -307,6 +310,26 @@ def _particles(path: Path, scene: Scene, interval: float) -> dict[str, Any]:
     }
 
 
+def _body(path: Path, scene: Scene) -> Body:
+    """Read and validate body.npz: the body at t = 0 of a recording without tracked points.
+
+    Raises:
+        UserError: An array is missing or malformed, or a particle lies outside the domain.
+    """
+    arrays = read_arrays(path, ("x0", "v0", "volume"), what="archive of arrays", others=False)
+    count = len(arrays["x0"])
+    for key, shape in (("x0", (count, 3)), ("v0", (count, 3)), ("volume", (count,))):
+        if arrays[key].shape != shape or arrays[key].dtype.kind != "f" or not count or not np.isfinite(arrays[key]).all():
+            raise UserError(f"{path}: {key} must hold finite floating-point numbers of the shape {shape}, got {arrays[key].shape}")
+    outside = ((arrays["x0"] < np.array(scene.lower)) | (arrays["x0"] > np.array(scene.upper))).any(axis=1)
+    if outside.any():
+        raise UserError(f"{path}: {outside.sum()} particles of x0 lie outside scene.domain")
+    if not np.ptp(arrays["x0"], axis=0).any() or not (arrays["volume"] > 0).all():
+        raise UserError(f"{path}: a body needs particles in several places and positive volumes")
+    x, v, volume = (torch.from_numpy(arrays[key].astype(np.float32)) for key in ("x0", "v0", "volume"))
+    return Body(x, v, volume)
+
+
 def _arrays(path: Path) -> dict[str, np.ndarray]:
     arrays = read_arrays(path, NEEDED, OPTIONAL, what="archive of arrays", others=False)
     if ("track" in arrays) == ("anchor" in arrays):
@@ -330,6 +353,9 @@ def _write_files(recording: Recording, folder: Path) -> None:
         kinds = {"t": np.float64, "track": np.int32}
         given = {key: array.numpy().astype(kinds.get(key, np.float32)) for key, array in arrays.items() if array is not None}
         write_arrays(folder / "particles.npz", given)
+    elif recording.body is not None:
+        body = recording.body
+        write_arrays(folder / "body.npz", {"x0": body.x.numpy(), "v0": body.v.numpy(), "volume": body.volume.numpy()})
     if recording.video is not None:
         source = recording.video.folder
         if not (source / "transforms.json").is_file():

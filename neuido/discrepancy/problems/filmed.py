@@ -198,23 +198,26 @@ def _cameras(cameras: Cameras, boxes: np.ndarray, size: tuple[int, int]) -> Came
 def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
     """Return the body at t = 0, and whether its velocity is known.
 
-    The particles come from particles.npz, else from `neuido reconstruct`, else they fill the visual hull of the first frame. The
-    velocity of a body without particles.npz comes from motion.yaml or the reconstruction, else it is estimated from the centroids of the
-    silhouettes in the first frames (and then counts as not known).
+    The particles come from particles.npz or body.npz, else from `neuido reconstruct`, else they fill the visual hull of the first frame.
+    The velocity of a body without particles.npz comes from motion.yaml, body.npz or the reconstruction. Where these give none, it is
+    estimated from the centroids of the silhouettes in the first frames, and counts as not known.
 
     Raises:
         UserError: There is one view alone, or the silhouettes have no common visual hull.
     """
-    if recording.body is not None:
+    if recording.body is not None and (recording.x is not None or bool(recording.body.v.any())):
         return recording.body, True
     own = experiment.folder / RECONSTRUCTION / "body.npz"
     filmed = [r for r in experiment.recordings if r.video is not None]
-    body = read_body(own) if own.is_file() and len(filmed) == 1 else None
+    body = recording.body
+    if body is None and own.is_file() and len(filmed) == 1:
+        body = read_body(own)
     found = recording.video
     chosen = [found.views[i] for i in _evenly(len(found.views), HULL_VIEWS)]
     if body is None and len(chosen) < 2:
         raise UserError(
-            f"recording {recording.name} has one view and no particles.npz: a body cannot be made of one silhouette; give x0, v0 and volume"
+            f"recording {recording.name} has one view and neither particles.npz nor body.npz: a body cannot be made of one silhouette; "
+            "give x0, v0 and volume"
         )
     views = SceneViews(found, views=chosen, find_masks=True, cache=False)
     first = min(4, len(views.frames))

@@ -153,8 +153,8 @@ class Problem:
     solvers: tuple[int, ...] = (0,)
     """Settings that stand for a simulation method each. The data choose among them."""
     labels: dict[str, Any] = field(default_factory=dict)
-    """Facts for the report: `kind` of the data, `body`, effects that are `excluded`, with the reason, and `ordinary` sizes that parameters
-    of effects have by the declared figures."""
+    """Facts for the report: `kind` of the data, `body`, effects that are `excluded`, with the reason, `ordinary` sizes that parameters of
+    effects have by the declared figures, and what the data leave `unseen`."""
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         """Predict the data of a recording for each parameter set, (len(points), n); a row is NaN where the simulation fails."""

@@ -40,6 +40,8 @@ FAINT = 0.15
 """Least noise of an outline [px of the compared silhouettes]."""
 LEAST_OVERLAP = 0.4
 """Least overlap of drawn and measured silhouette in the first frame (area of the intersection over that of the union)."""
+ONE_VIEW = "One view tells nothing of the line of sight: the depth of the body is as given, and motion and forces along it are not seen."
+"""What an answer from one camera cannot tell."""
 TRACKED = 60
 """Number of particles that represent the body where points are needed: for typical speeds, and to propose the next experiment."""
 
@@ -270,11 +272,12 @@ def video_problem(experiment: Experiment, *, device: str = "cpu", batch: int = 0
         nuisances += cameras
         recordings.append(_recording(r, footage[n], noise))
         footage[n] = footage[n]._replace(inset=_inset(footage[n], moved[n]))
+    labels = base.labels | ({"unseen": ONE_VIEW} if any(len(f.film.views) == 1 for f in footage) else {})
     kinds = tuple(f"camera_{key}{v}" for key, _, _ in CAMERA for v in range(max(len(f.film.views) for f in footage)))
     return VideoProblem(
         name=experiment.name, measure="outline", unit="px", declared=base.declared, nuisances=tuple(nuisances),
         candidates=base.candidates, recordings=tuple(recordings), settings=base.settings, solvers=base.solvers,
-        labels=base.labels, experiment=experiment, measured=tuple(tracked), device=device, batch=batch,
+        labels=labels, experiment=experiment, measured=tuple(tracked), device=device, batch=batch,
         instruments=(*INSTRUMENTS, *kinds), footage=tuple(footage),
     )  # fmt: skip
 

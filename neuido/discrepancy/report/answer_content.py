@@ -91,6 +91,8 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         content["not_predicted"] = failed
     if doubtful:
         content["doubts"] = doubtful
+    if "unseen" in d.problem.labels:
+        content["unseen"] = d.problem.labels["unseen"]
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
     drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}

@@ -151,6 +151,7 @@ def schema() -> Schema:
             "reach": NUMBER,
             "not_predicted": mapping(ANY_TEXT),
             "doubts": mapping(listing(TEXT)),
+            "unseen": TEXT,
             "silhouettes": {"type": "object"},
         },
     )

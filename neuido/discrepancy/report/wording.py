@@ -51,11 +51,13 @@ def words_of(c: Content, units: Units | None = None) -> Words:
 
 
 def _notes(c: Content) -> str:
-    """Return sentences on skipped steps, and on doubtful motions."""
+    """Return sentences on skipped steps, on doubtful motions, and on what the data cannot tell."""
     out = []
     if c["left_out"]:
         out.append(f"The search ended before {listed([worded(step) for step in c['left_out']])}: the same command with {more(c)} goes on.")
     out += [f"The prediction of {name} is doubtful, {'; '.join(events)}." for name, events in c.get("doubts", {}).items()]
+    if "unseen" in c:
+        out.append(c["unseen"])
     return " ".join(out)
 
 

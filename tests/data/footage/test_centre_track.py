@@ -81,7 +81,7 @@ def rival(i, image):
         (rival, {"scale": PIXEL}, "two things of similar size differ from the background"),
         (None, {}, "give --scale .metres per pixel., or --diameter"),
         (None, {"scale": PIXEL, "filming": Filming(start=3.0)}, "0 frames lie between --start 3 and --end 0.383 s"),
-        (None, {"scale": PIXEL, "kind": "body"}, "--kind body is not for videos"),
+        (None, {"scale": PIXEL, "kind": "material"}, "--kind material is not for videos"),
         (None, {"scale": PIXEL, "frame_rate": -1.0}, "--frame_rate must be above 0"),
         (None, {"scale": PIXEL, "floor": 0.0}, "--floor is for clips of several cameras .--cameras. or points on a deforming body"),
         (None, {"scale": PIXEL, "filming": Filming(offsets=[0.1])}, "--offsets is for clips of several cameras .*holds a video"),
