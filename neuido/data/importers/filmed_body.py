@@ -28,6 +28,8 @@ FAR = 100.0
 """Distance of the camera in widths of the picture: a scale in metres per pixel holds at every depth only from far away."""
 SYMMETRIC = 0.9
 """Least overlap of an outline and its mirror image (area of the intersection over that of the union) for a body of revolution."""
+ODD_SWING, MOST_SWING = 1.3, 2.0
+"""Ratios of the largest to the smallest outline of a clip that are said, and refused. A body that turns or is pressed flat changes less."""
 INSIDE = 0.5
 """Value of a soft mask on the outline."""
 UNSEEN = (
@@ -49,6 +51,8 @@ class Silhouettes(NamedTuple):
     """Upper right corner of all outlines [m], (2,)."""
     seen: int
     """Number of frames that show the object."""
+    swing: float
+    """Largest over smallest area of the whole outlines."""
 
 
 def write_filmed_body(
@@ -108,6 +112,11 @@ def write_filmed_body(
             arrays = {"x0": x0, "v0": np.zeros_like(x0), "volume": np.full(len(x0), volume / len(x0))}
             write_arrays(folder / name / "body.npz", {key: each.astype(np.float32) for key, each in arrays.items()})
             summary.append(f"{path.name}: {len(found.times)} frames, {found.seen} with the object; {len(x0)} particles, {words}")
+            if found.swing > ODD_SWING:
+                odd_area = f"odd: {path.name}: outlines differ in area by a factor of {found.swing:.2g}"
+                summary.append(
+                    f"{odd_area}; look at them (--picture), and give an image of the empty scene (--background) if they are wrong"
+                )
             recordings.append({"name": name, "role": roles[name], "frame_interval": float(np.median(np.diff(found.times)))})
             lows.append([*found.low, -depth])
             highs.append([*found.high, depth])
@@ -131,7 +140,8 @@ def _silhouettes(path: Path, folder: Path, filming: Filming, sheet: Sheet, scale
         raise UserError(f"{path}: {len(chosen)} frames lie between --start and --end; a diagnosis needs at least 4")
     times = clip.times[chosen] - clip.times[chosen[0]]
     background = background_of(clip, np.arange(len(clip.times)), filming.background_file)
-    first, seen, corners = np.zeros(0), 0, []
+    first, areas, corners = np.zeros(0), [], []
+    seen = 0
     (folder / "images").mkdir()
     for t, (image, found) in enumerate(sightings(clip, chosen, background)):
         sheet.add(path.name, t, len(chosen), image, found.mask, f"{clip.times[chosen[t]] - clip.times[0]:.3f} s")
@@ -145,13 +155,20 @@ def _silhouettes(path: Path, folder: Path, filming: Filming, sheet: Sheet, scale
                 )
         if found.area > 0:
             seen += 1
+            areas += [] if found.cut else [found.area]
             y, x = np.nonzero(found.mask >= INSIDE)
             corners += [(x.min(), clip.height - y.max() - 1), (x.max() + 1, clip.height - y.min())] if len(x) else []
         rgba = np.dstack([image, np.rint(255 * found.mask).astype(np.uint8)])
         nerfstudio.write_image(folder / f"images/0_{t:03d}.png", rgba)
     nerfstudio.write_transforms(folder, _camera(clip.width, clip.height, scale), torch.from_numpy(times))
     places = scale * np.array(corners, float)
-    return Silhouettes(times, first, places.min(axis=0), places.max(axis=0), seen)
+    swing = max(areas) / min(areas)
+    if swing > MOST_SWING:
+        raise UserError(
+            f"{path}: outlines differ in area by a factor of {swing:.2g}, as where the body covers its background in most frames: give an "
+            "image of the empty scene (--background), or cut the clip (--start, --end)"
+        )
+    return Silhouettes(times, first, places.min(axis=0), places.max(axis=0), seen, swing)
 
 
 def _camera(width: int, height: int, scale: float) -> Cameras:
