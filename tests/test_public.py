@@ -35,7 +35,7 @@ PUBLIC = {
         bind chamfer_distance deform fill load_gaussians load_law load_nclaw opacity_volume prepare rasterize read_law relative_lp
         render save_gaussians save_law small_strain_moduli visual_hull write_particles write_video
     """,
-    "neuido.physics": "FiniteElements Frames MassSpring Mesh Simulator colliders effects laws mesh_body",
+    "neuido.physics": "FiniteElements Frames MassSpring Mesh PlaneMotion PlaneSpecimen Simulator colliders effects laws mesh_body",
     "neuido.physics.colliders": """
         Capsule ColliderFrames ColliderTable Cuboid Cylinder HalfSpace HeightField MeshCollider SolidInputs Sphere
         collider_table planes_of

@@ -1,6 +1,7 @@
 from . import colliders, effects, laws
 from .fem.finite_elements import FiniteElements
 from .fem.meshing import Mesh, mesh_body
+from .fem.plane_specimen import PlaneMotion, PlaneSpecimen
 from .mpm.simulator import Simulator
 from .runtime.frames import Frames
 from .springs.mass_spring import MassSpring
@@ -10,6 +11,8 @@ __all__ = [
     "Frames",
     "MassSpring",
     "Mesh",
+    "PlaneMotion",
+    "PlaneSpecimen",
     "Simulator",
     "colliders",
     "effects",

@@ -1,4 +1,4 @@
-"""Explicit finite elements."""
+"""Finite elements: explicit ones of moving bodies, and quasi-static ones of flat specimens."""
 
 import lazy_loader
 
