@@ -121,7 +121,7 @@ def write_filmed_body(
             lows.append([*found.low, -depth])
             highs.append([*found.high, depth])
             spacings.append(spacing)
-        low, high = np.min(lows, axis=0), np.max(highs, axis=0)
+        low, high, spacing = np.min(lows, axis=0), np.max(highs, axis=0), float(np.median(spacings))
         content, notes = declared_content(
             next(iter(files)), low, high, float(np.median(spacings)), density, young, poisson, floor, recordings
         )
