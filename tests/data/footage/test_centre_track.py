@@ -83,7 +83,7 @@ def rival(i, image):
         (None, {"scale": PIXEL, "filming": Filming(start=3.0)}, "0 frames lie between --start 3 and --end 0.383 s"),
         (None, {"scale": PIXEL, "kind": "material"}, "--kind material is not for videos"),
         (None, {"scale": PIXEL, "frame_rate": -1.0}, "--frame_rate must be above 0"),
-        (None, {"scale": PIXEL, "floor": 0.0}, "--floor is for clips of several cameras .--cameras. or points on a deforming body"),
+        (None, {"scale": PIXEL, "floor": 0.0}, "--floor belongs to --guide bounce, and the track is that of a free flight"),
         (None, {"scale": PIXEL, "filming": Filming(offsets=[0.1])}, "--offsets is for clips of several cameras .*holds a video"),
         (None, {"mass": 0.057, "filming": Filming(cameras="board")}, "--mass is for .*holds clips of several cameras"),
         (None, {"scale": 0.0, "filming": Filming(cameras="board")}, "--scale must be above 0"),
