@@ -21,8 +21,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 def imported_names(of: set[str]) -> set[str]:
     """What the files import that name one of these packages."""
     found = set()
+    word = re.compile(rf"\b({'|'.join(of)})\b")  # a file that names none is not parsed
     for text in (path.read_text() for path in (ROOT / "neuido").rglob("*.py")):
-        for node in ast.walk(ast.parse(text)) if any(name in text for name in of) else ():
+        for node in ast.walk(ast.parse(text)) if word.search(text) else ():
             if isinstance(node, ast.Import):
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

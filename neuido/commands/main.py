@@ -46,7 +46,7 @@ LIGHT = {  # name: (module, function, one line for the list); the module must im
     "view": ("neuido.commands.viewing.view", "view_path", "Open a motion, a recording or a diagnosis in the browser, or run a scene live."),
     "render": ("neuido.commands.viewing.render", "render_path", "Draw a motion to a video or pictures, without a display."),
     "film": ("neuido.commands.film", "film", "Film simulated bodies of many materials, for the video encoder."),
-    "export": ("neuido.commands.output.export", "export", "Write a motion or a law for other programs: USD, glTF, VTK, Abaqus, C, ..."),
+    "export": ("neuido.commands.output.export", "export_path", "Write a motion or a law for other programs: USD, glTF, VTK, C, ..."),
     "doctor": ("neuido.commands.doctor", "doctor", "Print versions and devices, and run a small rollout on each device."),
 }
 

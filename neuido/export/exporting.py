@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from neuido.data.cameras import refuse_moving
 from neuido.errors import PlausibilityWarning, UserError, suggest
 from neuido.physics.laws.base import ElasticLaw
 from neuido.types import Cameras, Gaussians, Scene
@@ -134,6 +133,8 @@ def _collected(
             raise UserError("the motion has no deformation gradient F, with which the Gaussians could deform: leave out gaussians")
         made.gaussians = MovingSplats(gaussians, made.x, made.F)
     if cameras is not None:
+        from neuido.data.cameras import refuse_moving
+
         refuse_moving(cameras, "the recording", "only fixed ones are written; leave --cameras out, or give cameras.at(frame)")
     made.cameras = cameras
     return made

@@ -14,7 +14,7 @@ CARDS = ("abaqus", "ansys", "febio", "mujoco")
 LEARNED = ("torchscript", "c")
 
 
-def export(
+def export_path(
     source: str,
     *,
     to: Format,
