@@ -332,6 +332,8 @@ def elastic_kernels(own: SimpleNamespace, real: type, name: str, enable_backward
     stress_coefficients, stress_gradient = own.stress_coefficients, own.stress_gradient
     row4, row9 = _rows(own, real, name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=enable_backward)
 
     @kernel
     def features(F: wp.array(dtype=mat33), X: wp.array2d(dtype=real)):
@@ -347,7 +349,7 @@ def elastic_kernels(own: SimpleNamespace, real: type, name: str, enable_backward
         N, h, l, A, q = strain_invariants(F[p])
         tau[p] = stress_of(F[p], l, A, q, row4(c, p), scale)
 
-    @kernel
+    @adjoint_kernel
     def stress_coefficients_adjoint(
         F: wp.array(dtype=mat33),
         c: wp.array2d(dtype=real),
@@ -362,7 +364,7 @@ def elastic_kernels(own: SimpleNamespace, real: type, name: str, enable_backward
         for i in range(4):
             g_c[p, i] = g[i]
 
-    @kernel
+    @adjoint_kernel
     def stress_adjoint(
         F: wp.array(dtype=mat33),
         c: wp.array2d(dtype=real),
@@ -400,6 +402,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     correction_coefficients, correction_gradient = own.correction_coefficients, own.correction_gradient
     row4, row9 = _rows(own, real, name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=enable_backward)
 
     @kernel
     def correction(F: wp.array(dtype=mat33), c: wp.array2d(dtype=real), scale: real, out: wp.array(dtype=mat33)):
@@ -407,7 +411,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         N, h, l, A, q = strain_invariants(F[p])
         out[p] = correction_of(F[p], l, A, q, row4(c, p), scale)
 
-    @kernel
+    @adjoint_kernel
     def correction_coefficients_adjoint(
         F: wp.array(dtype=mat33),
         c: wp.array2d(dtype=real),
@@ -423,7 +427,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         for i in range(3):
             g_c[p, i] = g[i]
 
-    @kernel
+    @adjoint_kernel
     def correction_adjoint(
         F: wp.array(dtype=mat33),
         c: wp.array2d(dtype=real),
