@@ -30,6 +30,10 @@ WIDTHS = (32, 64)
 STRESS, CORRECTION, BOUNDED = "stress", "correction", "bounded"
 """Read-outs of an objective law: coefficients of a stress, radii of a yield surface, moduli of a bounded stress."""
 
+BATCH, BATCH_NUMBERS = 16, 2**27
+"""Most substeps whose activations are kept for one product of matrices, and numbers that they may take: half a gigabyte. A product and a
+sum for each substep took longer than the networks (few-shot on an H200: 47 of 171 ms a step)."""
+
 BLOCK = 32
 """Threads per block; with one warp per block, the warps of a small body spread evenly over the multiprocessors."""
 
@@ -233,32 +237,41 @@ class FusedEngine(Engine):
         if self.ends:
             self.P3, self.PB = like.new_zeros(self.threads * self.width // 8), like.new_zeros(len(self.warps[0]) * 4)
         if self.full:
-            self.X = like.new_empty(count, 9)
-            self.H1, self.G1, self.G2 = (like.new_empty(count * self.width) for _ in range(3))
+            depth = max(1, min(BATCH, BATCH_NUMBERS // max(1, count * (9 + 3 * self.width))))
+            self.X = like.new_empty(depth, count, 9)
+            self.H1, self.G1, self.G2 = (like.new_empty(depth, count, self.width) for _ in range(3))
+            self.filled = 0
 
     def adjoint(self, F: Tensor, grad_out: Tensor, grad_F: Tensor) -> None:
+        kept = [self.X[self.filled], *(t[self.filled].view(-1) for t in (self.H1, self.G1, self.G2))] if self.full else [None] * 4
         arguments = [F, *self.warps, *self.rows, *self.packed, self.law.scale, *self.transposed, grad_out, grad_F,
-                     self.P3, self.PB, self.X, self.H1, self.G1, self.G2]  # fmt: skip
+                     self.P3, self.PB, *kept]  # fmt: skip
         launch(self.kernels.adjoint, self.threads, arguments, F.device, block=BLOCK)
         if self.full:
-            self._add_layer_gradients(len(F))
+            self.filled += 1
+            if self.filled == len(self.X):
+                self._add_layer_gradients()
 
-    def _add_layer_gradients(self, count: int) -> None:
-        """Add to the gradients of the first two layers, which all scenes share or each scene has for itself."""
+    def _add_layer_gradients(self) -> None:
+        """Add the kept substeps to the gradients of the first two layers, which all scenes share or each scene has for itself."""
         g1, b1, g2, b2 = self.grads[:4]
-        h1, d1, d2 = (t.view(count, self.width) for t in (self.H1, self.G1, self.G2))
-        ranges = [(0, 0, count)] if self.rows[0] == 1 else [
+        x, h1, d1, d2 = (t[: self.filled] for t in (self.X, self.H1, self.G1, self.G2))
+        self.filled = 0
+        ranges = [(0, 0, x.shape[1])] if self.rows[0] == 1 else [
             (s, i, j) for s, (i, j) in enumerate(zip(self.particles.offsets[:-1], self.particles.offsets[1:]))
         ]  # fmt: skip
         for s, i, j in ranges:
-            for target, d, value in ((g1, d1, self.X), (g2, d2, h1)):
+            own = [t[:, i:j].flatten(0, 1) for t in (x, h1, d1, d2)]
+            for target, d, value in ((g1, own[2], own[0]), (g2, own[3], own[1])):
                 if target is not None:
-                    target[min(s, len(target) - 1)].addmm_(d[i:j].T, value[i:j])
-            for target, d in ((b1, d1), (b2, d2)):
+                    target[min(s, len(target) - 1)].addmm_(d.T, value)
+            for target, d in ((b1, own[2]), (b2, own[3])):
                 if target is not None:
-                    target[min(s, len(target) - 1)].add_(d[i:j].sum(0))
+                    target[min(s, len(target) - 1)].add_(d.sum(0))
 
     def gradients(self) -> list[Tensor | None]:
+        if self.full and self.filled:
+            self._add_layer_gradients()
         if self.ends:
             # in the part of a warp, lane (g, t) of tile j holds output g % 4 of column 8 j + 2 t + g / 4
             tiles = self.width // 8

@@ -5,7 +5,7 @@ import torch
 import warp as wp
 
 from neuido.errors import UserError
-from neuido.physics.laws.neural import bounded_kernels, network_kernels, networks, readouts
+from neuido.physics.laws.neural import bounded_kernels, fused, network_kernels, networks, readouts
 from neuido.physics.laws.neural.bounded import BoundedElastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 from neuido.types import Particles
@@ -232,3 +232,37 @@ def test_wrong_shapes_are_named():
     weights[4] = weights[4][:, :2]
     with pytest.raises(UserError, match="W3 has shape"):
         ObjectiveElastic(*weights)
+
+
+@pytest.mark.parametrize("shared", [1, 2])
+@pytest.mark.parametrize("depth", [1, 2, 16])
+def test_layer_gradients_of_a_gpu_add_up_over_kept_substeps(shared, depth, monkeypatch):
+    """The kernel is replaced by one that writes given activations; two scenes share the first layers or have their own."""
+    g = torch.Generator().manual_seed(0)
+    offsets, width, substeps = (0, 5, 12), 32, 5
+    weights = [torch.randn(shared, width, 9, generator=g), torch.randn(shared, width, generator=g)]
+    weights += [torch.randn(shared, width, width, generator=g), torch.randn(shared, width, generator=g)]
+    weights += [torch.randn(2, 4, width, generator=g), torch.randn(2, 4, generator=g)]
+    scene = torch.repeat_interleave(torch.arange(2, dtype=torch.int32), torch.tensor([5, 7]))
+    given = [[torch.randn(12, n, generator=g) for n in (9, width, width, width)] for _ in range(substeps)]
+    written = iter(given)
+
+    def write(kernel, threads, arguments, device, *, block):
+        for target, values in zip(arguments[-4:], next(written), strict=True):
+            target.view(12, -1).copy_(values)
+
+    monkeypatch.setattr(fused, "launch", write)
+    monkeypatch.setattr(fused, "BATCH", depth)
+    engine = fused.FusedEngine(ObjectiveElastic(*weights), weights, Particles(scene, offsets))
+    engine.start_adjoint([True] * 4 + [False] * 2)
+    F = torch.eye(3).expand(12, 3, 3).contiguous()
+    for _ in range(substeps):
+        engine.adjoint(F, F, F.clone())
+    found = engine.gradients()
+    rows = scene.long() if shared == 2 else torch.zeros(12, dtype=torch.long)
+    for n in range(shared):
+        own = rows == n
+        true = [sum(d1[own].T @ x[own] for x, _, d1, _ in given), sum(d1[own].sum(0) for _, _, d1, _ in given)]
+        true += [sum(d2[own].T @ h[own] for _, h, _, d2 in given), sum(d2[own].sum(0) for *_, d2 in given)]
+        for a, b in zip(found[:4], true):
+            torch.testing.assert_close(a[n], b, rtol=1e-5, atol=1e-5)
