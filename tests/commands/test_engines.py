@@ -3,10 +3,12 @@
 import csv
 import importlib.util
 import os
+import signal
+from types import SimpleNamespace
 
 import pytest
 
-from neuido.commands.engines import local_pool
+from neuido.commands.engines import local_pool, ray_cluster
 from neuido.commands.engines.many_diagnoses import diagnose_folder, diagnose_folders
 from neuido.commands.engines.outcome import RETRIES, Share, attempt
 from neuido.commands.engines.task_folder import finish, finished, joined, local_copy, written
@@ -96,6 +98,31 @@ def test_a_mark_that_is_damaged_does_not_count(tmp_path):
     finish(str(tmp_path), "x", {"answer": "none"})
     (tmp_path / ".task.json").write_text('{"digest": "x", ')
     assert finished(str(tmp_path), "x") is None
+
+
+@pytest.mark.parametrize("address", [None, "nowhere:1"])
+def test_a_cluster_that_does_not_start_is_one_line(monkeypatch, address):
+    def init(**options):
+        raise Exception("The current node timed out")  # as Ray raises it
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    ray = SimpleNamespace(is_initialized=lambda: False, init=init)
+    line = f"address = {address}: no Ray cluster answers there" if address else "no cluster can be started on this machine"
+    with pytest.raises(UserError, match=f"{line}: The current node timed out"), ray_cluster._connected(ray, address):
+        pass
+
+
+def test_signals_end_the_command_as_they_did_before_ray_was_started():
+    """Ray's own handler of SIGTERM ends the process by SIGABRT."""
+    before, ended = signal.getsignal(signal.SIGTERM), []
+    ray = SimpleNamespace(
+        is_initialized=lambda: False,
+        init=lambda **options: signal.signal(signal.SIGTERM, signal.SIG_IGN),
+        shutdown=lambda: ended.append(True),
+    )
+    with ray_cluster._connected(ray, None):
+        assert signal.getsignal(signal.SIGTERM) is before
+    assert ended
 
 
 @pytest.mark.slow

@@ -293,12 +293,15 @@ def _forked(
 
 
 def _processor_seconds(pid: int) -> tuple[float, bool]:
-    """Return how long a process has worked [s], and whether it sleeps now."""
+    """Return how long a process and those that it started have worked [s], and whether all of them sleep now."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:
-        return 0.0, False
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"), fields[0] == "S"
+        return 0.0, True
+    below = [_processor_seconds(int(child)) for child in children]
+    own = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return own + sum(seconds for seconds, _ in below), fields[0] == "S" and all(sleeps for _, sleeps in below)
 
 
 def _child(words: list[str], box: Path, root: Path, prepare: Callable[[], None], pipes: list[int]) -> None:

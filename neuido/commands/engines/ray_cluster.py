@@ -2,9 +2,12 @@
 
 import contextlib
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from neuido.commands.cli.interruption import SIGNALS
 from neuido.commands.engines.outcome import RETRIES, Outcome, Share, attempt
 from neuido.errors import UserError, shortened
 
@@ -62,10 +65,16 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
         yield
         return
     own = {} if address or os.environ.get("RAY_ADDRESS") else {"include_dashboard": False}
+    handlers = {number: signal.getsignal(number) for number in SIGNALS}
     try:
         ray.init(address=address, log_to_driver=False, logging_level="error", **own)
-    except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-        raise UserError(f"address = {address or os.environ.get('RAY_ADDRESS')}: no Ray cluster answers there: {error}") from error
+        if threading.current_thread() is threading.main_thread():  # Ray puts its own handler of SIGTERM there
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    except Exception as error:  # of many types, plain `Exception` among them
+        there = address or os.environ.get("RAY_ADDRESS")
+        what = f"address = {there}: no Ray cluster answers there" if there else "engine = ray: no cluster can be started on this machine"
+        raise UserError(f"{what}: {error}") from error
     try:
         yield
     finally:
