@@ -126,3 +126,16 @@ def test_every_dependency_is_listed_with_its_licence():
     listed = {name for name, what, licence in rows if what.strip() and licence.strip()}
     needed = {re.split(r"[^\w-]", each)[0] for each in PROJECT["dependencies"]}
     assert listed - {"package", "---"} == needed
+
+
+def test_every_package_of_an_extra_is_listed_with_its_extra():
+    text = (ROOT / "docs" / "reference" / "dependencies.md").read_text()
+    for extra, packages in PROJECT["optional-dependencies"].items():
+        rows = [line for line in text.splitlines() if f"`{extra}`" in line]
+        for name in (re.split(r"[^\w-]", each)[0] for each in packages):
+            known = name in ("neuido", *(re.split(r"[^\w-]", each)[0] for each in PROJECT["dependencies"]))
+            assert (
+                known
+                or any(re.search(rf"\b{re.escape(name)}\b", row) for row in rows)
+                or (extra in ("dev", "docs") and f"| {name} (" in text)
+            ), (extra, name)
