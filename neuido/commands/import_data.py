@@ -109,6 +109,7 @@ def import_data(
         end: Of a video, the last moment to use, s.
         background: Of a video, an image of the empty scene; the median of the frames where absent.
         cameras: Of the clips of one motion from several cameras: board (a printed ChArUco board), colmap, or a recording with their views.
+            Of tables of pixels, one a view and named like it, the recording: the points are triangulated.
         board: Its squares in x and y, side of a square, side of a marker, dictionary, as "7x5 40 mm 30 mm 4X4_50".
         synchronise: How clips of several cameras are aligned in time: none (started together), flash (of light) or audio (a clap).
         offsets: Instead, what to add to the times of each clip, s.

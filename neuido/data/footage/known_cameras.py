@@ -29,7 +29,9 @@ def recorded_cameras(path: Path, clips: Sequence[Clip]) -> tuple[list[View], lis
         UserError: The recording cannot be read, a clip has no view of its name, or the image sizes have other aspect ratios.
     """
     found = read_recording(path)
-    return _of_views(found, clips, f"--cameras {path}"), [f"cameras of {path} ({found.format})"]
+    return views_of(found, [clip.path for clip in clips], f"--cameras {path}", [(clip.width, clip.height) for clip in clips]), [
+        f"cameras of {path} ({found.format})"
+    ]
 
 
 def reconstructed_cameras(clips: Sequence[Clip], filming: Filming) -> tuple[list[View], list[str]]:
@@ -60,21 +62,36 @@ def reconstructed_cameras(clips: Sequence[Clip], filming: Filming) -> tuple[list
         largest.write(folder / "sparse")
         found = colmap.views(folder / "sparse", folder / "images", folder=folder, name="clips")
         error = float(largest.compute_mean_reprojection_error())
-        return _of_views(found, clips, "--cameras colmap"), [f"cameras by COLMAP, {largest.num_points3D()} points within {error:.2g} px"]
+        sizes = [(clip.width, clip.height) for clip in clips]
+        return views_of(found, [clip.path for clip in clips], "--cameras colmap", sizes), [
+            f"cameras by COLMAP, {largest.num_points3D()} points within {error:.2g} px"
+        ]
 
 
-def _of_views(found: MultiView, clips: Sequence[Clip], option: str) -> list[View]:
+def views_of(found: MultiView, files: Sequence[Path], option: str, sizes: Sequence[tuple[int, int]] | None = None) -> list[View]:
+    """Return the camera of each file, that of the view of its name.
+
+    Args:
+        found: A recording.
+        files: Clips or tables; the view of `left.mp4` is `left`, or an image `left.png`.
+        option: The user's option in messages.
+        sizes: Width and height of the images of each file [px]; None: those of the recording.
+
+    Raises:
+        UserError: A file has no view of its name, an image size has another aspect ratio, or the cameras move.
+    """
     convert.refuse_moving(found.cameras, option, "clips need one pose for each view; give a recording of fixed cameras")
-    stems = {Path(view).stem: v for v, view in enumerate(found.views)} | {view: v for v, view in enumerate(found.views)}
+    stems = {path.stem: v for v, row in enumerate(found.images) for path in row[:1] if path is not None}
+    stems |= {Path(view).stem: v for v, view in enumerate(found.views)} | {view: v for v, view in enumerate(found.views)}
     views = []
-    for clip in clips:
-        if clip.path.stem not in stems:
-            raise UserError(f"{option} has no view {clip.path.stem!r} for {clip.path.name}: it has {', '.join(found.views[:12])}")
-        v = stems[clip.path.stem]
-        ratio = np.array([clip.width / found.cameras.width, clip.height / found.cameras.height, 1.0])
+    for file, (width, height) in zip(files, sizes or [(found.cameras.width, found.cameras.height)] * len(files)):
+        if file.stem not in stems:
+            raise UserError(f"{option} has no view {file.stem!r} for {file.name}: it has {', '.join(list(stems)[:12])}")
+        v = stems[file.stem]
+        ratio = np.array([width / found.cameras.width, height / found.cameras.height, 1.0])
         if abs(ratio[0] / ratio[1] - 1) > SAME_ASPECT:
             raise UserError(
-                f"{clip.path} has {clip.width} x {clip.height} px, its camera in {option} {found.cameras.width} x {found.cameras.height}, "
+                f"{file} has {width} x {height} px, its camera in {option} {found.cameras.width} x {found.cameras.height}, "
                 "another aspect ratio"
             )
         lens = () if found.distortion is None else tuple(found.distortion[v].tolist())

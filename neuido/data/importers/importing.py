@@ -118,7 +118,8 @@ def import_file(
     shared = guided.pop("length", None)  # of a specimen too
     dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
     filmed = {key: None if value == "none" else value for key, value in filming._asdict().items()}
-    several = {key: filmed.pop(key) for key in ("board", "synchronise", "offsets")}
+    several = {key: filmed.pop(key) for key in ("board", "synchronise")}
+    placed = {key: filmed.pop(key) for key in ("cameras", "offsets")}
     _check_options(
         paths[0].name,
         "views" if films and filming.cameras is not None else "outlines" if outlines else "film" if films else chosen,
@@ -135,7 +136,12 @@ def import_file(
         (("material", "field", "track", "film"), {"length": shared or dimensions["length"]}),
         (("material", "film", "outlines", "views", "track", "body"), {"held_out": held_out or None}),
         (("field",), {"forces": forces, "region": region}),
+<<<<<<< HEAD
         (("film", "outlines", "views"), filmed),
+=======
+        (("film", "views"), filmed),
+        (("views", "track", "body"), placed),
+>>>>>>> 3a88b9f (Triangulate pixel tracks of calibrated cameras)
         (("views",), several),
     )  # fmt: skip
     if films:
@@ -179,6 +185,7 @@ def import_file(
         motion = Motion(found.t, {"object": found.x}, found.unit, False, found.notes, True)
         return {"": in_si(path, motion, units, axes._replace(y_down=False))._replace(scale_error=found.scale_error)}
 
+    cameras = filming.cameras is not None and not films
     said = [f"read as {WHAT[chosen]} (--kind {chosen})"] if kind == "auto" and not films else []
     if chosen == "material":
         summary = write_material_tests(
@@ -211,12 +218,16 @@ def import_file(
     else:
         takes: dict[str, tuple[Path, RecordedMotion]] = {}
         of_file: dict[str, list[str]] = {}
-        for name, path in files_by_name.items():
+        for name, path in {} if cameras else files_by_name.items():
             with naming(path):
                 for label, motion in read(path).items():
                     own = recording_name(f"{name}-{label}" if label else name, takes)
                     takes[own] = (path, motion)
                     of_file.setdefault(name, []).append(own)
+        if cameras:
+            from neuido.data.importers.view_tracks import read_view_tracks
+
+            takes["views"] = (Path(str(filming.cameras)), read_view_tracks(paths, filming, columns, units, axes))
         roles = roles_of(list(takes), held_out, of_file)
         if chosen == "track":
             summary = write_tracks(takes, out, roles=roles, point=point, mass=mass, diameter=diameter, guide=guide, floor=floor)

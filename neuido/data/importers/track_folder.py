@@ -44,6 +44,8 @@ class RecordedMotion(NamedTuple):
     """Relative error of the scale; 0 if it is given."""
     angle: bool = False
     """Whether the only coordinate of the only point is an angle [rad]."""
+    start: float = 0.0
+    """Time of the first frame in the file [s]."""
 
 
 def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> RecordedMotion:
@@ -55,7 +57,8 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
     if not motion.points:
         raise UserError(f"{path.name} contains no positions: name their columns with --columns.x TITLE --columns.y TITLE")
     notes = list(motion.notes)
-    t, order = _times(path, motion, units, axes, notes)
+    clock, order = _times(path, motion, units, axes, notes)
+    t = clock - clock[0]
     if motion.unit.partition(" ")[0] == ANGLE:
         unit = units.get("angle") or motion.unit.partition(" ")[2]
         if not unit:
@@ -79,12 +82,15 @@ def in_si(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes) -> R
         x = x * ratio
         if axes.y_down and x.shape[1] > 1:
             x[:, 1] *= -1
-        if axes.up == "z" and x.shape[1] == 3:
-            x = np.stack([x[:, 0], x[:, 2], -x[:, 1]], 1)
-        points[name] = x
+        points[name] = upright(x, axes.up)
     if lost:
         notes.append(f"{lost} positions of exactly 0 or -9999 count as not seen")
-    return RecordedMotion(t, points, notes)
+    return RecordedMotion(t, points, notes, start=float(clock[0]))
+
+
+def upright(x: np.ndarray, up: str) -> np.ndarray:
+    """Return positions (T, A) with +y up, of which `up` points up."""
+    return np.stack([x[:, 0], x[:, 2], -x[:, 1]], 1) if up == "z" and x.shape[1] == 3 else x
 
 
 def write_tracks(
@@ -117,7 +123,7 @@ def write_tracks(
 
     summary, tables, recordings, scale_error = [], {}, [], 0.0
     model, said = declared_guide(guide, floor=floor, mass=mass)
-    for name, (path, (t, points, notes, error, angle)) in takes.items():
+    for name, (path, (t, points, notes, error, angle, _)) in takes.items():
         with naming(path):
             x = one_point(points, point, path)
         if angle and guide.type not in ("pendulum", "axis"):
@@ -171,7 +177,7 @@ def one_point(points: Mapping[str, np.ndarray], point: str | None, path: Path) -
 
 
 def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Return increasing times from 0 [s], and the rows that they belong to; append what was done to `notes`."""
+    """Return increasing times [s], and the rows that they belong to; append what was done to `notes`."""
     t = motion.t
     if motion.frames:
         if axes.frame_rate is None:
@@ -202,7 +208,7 @@ def _times(path: Path, motion: Motion, units: Mapping[str, str], axes: Axes, not
     if steps.max() > 3 * np.median(steps):
         row = int(np.argmax(steps))
         notes.append(f"a gap of {steps.max():.3g} s after {t[row] - t[0]:.4g} s; frames are {np.median(steps):.3g} s apart")
-    return t - t[0], kept
+    return t, kept
 
 
 def _check_repeats(path: Path, t: np.ndarray, points: Mapping[str, np.ndarray], frame_rate: float | None) -> None:

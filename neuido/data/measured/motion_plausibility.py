@@ -170,7 +170,8 @@ def check_track(t: np.ndarray, x: np.ndarray, axes: Sequence[str], where: str, *
     if pivot is not None:
         _warn(
             f"{where}: the point moves to and fro on a circle of {pivot:.3g} m, as on a pivot, and no constraint is declared: give "
-            f"model.constraint: {{type: pendulum, length: {pivot:.3g}}}"
+            f"model.constraint: {{type: pendulum, length: {pivot:.3g}}} "
+            "(`neuido import --guide pendulum`)"
         )
 
 
@@ -206,7 +207,8 @@ def check_bounces(t: np.ndarray, x: np.ndarray, axis: str, where: str) -> None:
         row = turns[0]
         _warn(
             f"{where}: {axis} turns round within a few rows at {t[row]:.4g} s (data row {row}), as in a bounce, and no constraint is "
-            f"declared: give model.constraint: {{type: bounce, floor: {np.min(x):.4g}, restitution: 0.8}}, or rows: [0, {row}]"
+            f"declared: give model.constraint: {{type: bounce, floor: {np.min(x):.4g}, restitution: 0.8}}, or rows: [0, {row}] "
+            "(`neuido import --guide bounce`)"
         )
 
 

@@ -12,7 +12,7 @@ _SPELLED = {
     "°c": "degC", "sec": "s", "seconds": "s", "msec": "ms", "n/mm²": "N/mm^2", "n/mm2": "N/mm^2", "mm/mm": "", "-": "", "%": "percent",
     "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "kn": "kN", "newton": "N", "px": "pixel",
     "meters": "m", "millimeters": "mm", "centimeters": "cm", "metres": "m", "millimetres": "mm", "centimetres": "cm", "inches": "inch",
-    "lbs": "lbf", "lb": "lbf", "pounds": "lbf", "kp": "kgf", "kg": "kgf", "µstrain": "microstrain",
+    "lbs": "lbf", "lb": "lbf", "pounds": "lbf", "kp": "kgf", "kg": "kgf", "°": "deg", "grad": "deg", "µstrain": "microstrain",
     "m/m": "", "in/in": "", "cm/cm": "", "secs": "s", "sekunden": "s", "secondes": "s", "segundos": "s", "minuten": "min", "minutes": "min",
 }  # fmt: skip
 
@@ -65,7 +65,7 @@ def parse_quantity(text: str, to: str, option: str) -> float:
     Raises:
         UserError: The text is not a number with a unit, or the number is not positive.
     """
-    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s\d].*)", str(text))
+    found = re.fullmatch(r"\s*([0-9.]+(?:[eE][-+]?[0-9]+)?)\s*([^\s\d.].*)", str(text))
     if found is None or found[1].count(".") > 1:
         raise UserError(f"--{option} = {text!r} must be a number with a unit, for example '25.4 mm'")
     value = float(found[1]) * conversion_factor(found[2].strip(), to, f"--{option}")
