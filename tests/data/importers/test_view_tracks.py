@@ -92,16 +92,17 @@ def test_clocks(stage, tmp_path):
 
 
 def test_what_does_not_belong_together(stage, tmp_path):
+    both = lambda: [stage(0), stage(1)]  # noqa: E731
     for files, options, words in (
-        ([stage(1, name="cam0.csv"), stage(0, name="cam1.csv")], {}, "lines of sight miss each other by"),
-        ([stage(0, y_up=True), stage(1, y_up=True)], {}, "does y point down from the upper left corner"),
-        ([stage(0)], {}, "of one view give --scale instead"),
-        ([stage(0), stage(1, name="side.csv")], {}, r"no view 'side' for side\.csv: it has cam0, cam1, cam2"),
-        ([stage(0), stage(1)], {"offsets": [0.0]}, "--offsets has 1 numbers for 2 views"),
-        ([stage(0), stage(1)], {"up": "x"}, "--up x must be y or z"),
+        (lambda: [stage(1, name="cam0.csv"), stage(0, name="cam1.csv")], {}, "lines of sight miss each other by"),
+        (lambda: [stage(0, y_up=True), stage(1, y_up=True)], {}, "does y point down from the upper left corner"),
+        (lambda: [stage(0)], {}, "of one view give --scale instead"),
+        (lambda: [stage(0), stage(1, name="side.csv")], {}, r"no view 'side' for side\.csv: it has cam0, cam1, cam2"),
+        (both, {"offsets": [0.0]}, "--offsets has 1 numbers for 2 views"),
+        (both, {"up": "x"}, "--up x must be y or z"),
     ):
         with pytest.raises(UserError, match=words):
-            imported(stage, files, tmp_path / "out", **options)
+            imported(stage, files(), tmp_path / "out", **options)
         assert not (tmp_path / "out").exists()
     with pytest.raises(UserError, match="--cameras board is for videos"):
         neuido.import_file([stage(0), stage(1)], None, filming=Filming(cameras="board"))

@@ -10,6 +10,8 @@ from neuido.errors import UserError
 
 DAY = 86400.0
 """[s]"""
+NEW_YEAR = date(2000, 1, 1).toordinal()
+"""Day from which dates are counted, so that seconds keep a tenth of a microsecond."""
 DROPPED = 2
 """Frame numbers that drop-frame timecode (SMPTE ST 12-1) leaves out each minute but every tenth, so that 30 a second count 29.97."""
 HUNDREDTHS = 61
@@ -42,7 +44,7 @@ def clock_seconds(cell: str) -> float:
 
 
 def _day(text: str) -> int | None:
-    """Return the number of a day; `3/5/2024` is the fifth of March, and the third of May is `3.5.2024`."""
+    """Return the number of a day since the year 2000; `3/5/2024` is the fifth of March, and the third of May is `3.5.2024`."""
     parts = [int(part) for part in re.split(r"[-/.]", text)]
     if parts[0] > 31:
         year, month, day = parts
@@ -51,7 +53,7 @@ def _day(text: str) -> int | None:
     else:
         day, month, year = parts
     try:
-        return date(year, month, day).toordinal()
+        return date(year, month, day).toordinal() - NEW_YEAR
     except ValueError:
         return None
 

@@ -237,10 +237,11 @@ def _under_groups(groups: list[str], titles: list[str], units: list[str]) -> tup
     if any(map(_is_value, groups)) or sum(map(bool, groups)) < 1 or len(groups) > len(titles):
         return titles, units
     wide, last = [], ""
-    for cell in [*groups, *[""] * (len(titles) - len(groups))]:
+    for cell in [*groups, *[""] * (len(titles) - len(groups))]:  # a merged cell holds its text in the first column alone
         last = " ".join(cell[:LONGEST_TITLE].split()) or last
         wide.append(last)
-    joined = [f"{group} {title}".strip() if title else "" for group, title in zip(wide, titles)]
+    bare = [*groups, *[""] * (len(titles) - len(groups))]
+    joined = [f"{group} {title}" if title else own for group, title, own in zip(wide, titles, bare)]
     if len(find_columns(joined)) > len(find_columns(titles)):
         titles = joined
     units = list(units)
