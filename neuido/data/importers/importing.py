@@ -136,12 +136,8 @@ def import_file(
         (("material", "field", "track", "film"), {"length": shared or dimensions["length"]}),
         (("material", "film", "outlines", "views", "track", "body"), {"held_out": held_out or None}),
         (("field",), {"forces": forces, "region": region}),
-<<<<<<< HEAD
         (("film", "outlines", "views"), filmed),
-=======
-        (("film", "views"), filmed),
         (("views", "track", "body"), placed),
->>>>>>> 3a88b9f (Triangulate pixel tracks of calibrated cameras)
         (("views",), several),
     )  # fmt: skip
     if films:

@@ -46,8 +46,8 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ|.longation relative",
     "strain": r".*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
     "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
-    "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|verl.ngerung|position|"
-    r"deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
+    "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|"
+    r"verl.ngerung|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
     r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub",
     "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
     "frame": r"frames?( ?#)?|frame[ _]?(idx|index|no\.?|nr\.?|number|id)|"
