@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -108,11 +109,28 @@ LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.scenes
                                             "cli.trainer", "cli.trainer_help", "cli.signatures", "cli.functions")))  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def loaded() -> dict[str, list[str]]:
+    """What each light module loads, in a fork each of a fresh process that has imported nothing of the package."""
+    code = """
+import importlib, json, os, sys
+
+for module in sys.argv[1:]:
+    if not os.fork():
+        importlib.import_module(module)
+        print(json.dumps([module, sorted({"torch", "lightning", "warp", "jsonargparse"} & set(sys.modules))]), flush=True)
+        os._exit(0)
+    os.wait()
+"""
+    modules = [f"neuido{name}" for name in LIGHT]
+    answer = subprocess.run([sys.executable, "-c", code, *modules], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
+    assert not answer.stderr
+    return dict(map(json.loads, answer.stdout.splitlines()))
+
+
 @pytest.mark.parametrize("module", [f"neuido{name}" for name in LIGHT])
-def test_light_modules_load_neither_torch_nor_lightning(module):
-    code = f"import sys, {module}; print(sorted({{'torch', 'lightning', 'warp', 'jsonargparse'}} & set(sys.modules)))"
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=PACKAGE.parent, check=True)
-    assert answer.stdout.strip() == "[]"
+def test_light_modules_load_neither_torch_nor_lightning(loaded, module):
+    assert loaded[module] == []
 
 
 # The drawn structure. An `__init__.py` is a face: it defines nothing and imports nothing of the package; its stub names what it hands on.
