@@ -28,6 +28,8 @@ MARGIN = 0.3
 """Margin of a silhouette around the body, in longest sides of the body in the images."""
 PARTICLES = 2000
 """Number of particles of a body that is reconstructed from silhouettes."""
+VELOCITY_FRAMES = 7
+"""Frames from which the initial velocity is estimated, by a parabola: a line would be late by half of them where air brakes the body."""
 HULL_VIEWS = 12
 """Largest number of views from which a body is reconstructed."""
 OPACITY = 0.9
@@ -220,7 +222,7 @@ def body_of(experiment: Experiment, recording: Recording) -> tuple[Body, bool]:
             "give x0, v0 and volume"
         )
     views = SceneViews(found, views=chosen, find_masks=True, cache=False)
-    first = min(4, len(views.frames))
+    first = min(VELOCITY_FRAMES, len(views.frames))
     masks = np.stack([_masks(views, v, list(range(first))) for v in range(len(chosen))], axis=1)
     if body is None:
         lower, upper = recording.scene.lower, recording.scene.upper
@@ -257,7 +259,7 @@ def _velocity(masks: np.ndarray, cameras: Cameras, times: np.ndarray, gravity: n
                 normal, right = normal + across, right + across @ eye
         path.append(np.linalg.solve(normal + 1e-9 * np.eye(3), right))
     fallen = np.array(path) - 0.5 * times[:, None] ** 2 * gravity
-    return np.polyfit(times, fallen, 1)[0]
+    return np.polyfit(times, fallen, 2 if len(times) >= VELOCITY_FRAMES else 1)[-2]
 
 
 def looks(recording: Recording, experiment: Experiment, body: Body, film: Film, device: str) -> "Look | Splats":

@@ -135,4 +135,4 @@ def test_from_a_video_of_a_body_to_the_missing_effect(tmp_path, capsys, monkeypa
     assert status == 0, err
     assert "The model lacks linear air drag" in out and "tells nothing of the line of sight" in out
     (effect,) = neuido.Diagnosis.read(tmp_path / "answer").effects
-    assert effect.name == "drag_linear" and effect.parameters["k"].value == pytest.approx(3.0, rel=0.25)
+    assert effect.name == "drag_linear" and effect.parameters["k"].value == pytest.approx(3.0, rel=0.1)
