@@ -246,7 +246,10 @@ class DynamicsEncoder(nn.Module):
         views = list(views)
         cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[views], Ks=batch.cameras.Ks[views])
         options = {"size": self.flow["flow_size"], "preset": self.flow["flow_preset"], "cache": cache}
-        return measure_velocities(batch.images[views], batch.masks[views], batch.times, cameras, centre, **options)
+        images, masks = (
+            [t[v] for v in views] for t in (batch.images, batch.masks)
+        )  # views of the memory: a copy takes as long as the flow
+        return measure_velocities(images, masks, batch.times, cameras, centre, **options)
 
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
         """Return z (d,) from flow latents and conditions: the mean of the projector output over the views."""

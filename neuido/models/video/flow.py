@@ -36,11 +36,11 @@ SECTORS = (15, 6, 4, 11, 13, 6)
 """Number of hues of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
 
 
-def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None = None) -> Tensor:
+def optical_flow(images: Tensor | Sequence[Tensor], *, preset: str = "medium", threads: int | None = None) -> Tensor:
     """Compute the dense flow from each frame to the next [px per frame] by DIS.
 
     Args:
-        images: RGB in [0, 1], (..., T, H, W, 3), T >= 2.
+        images: RGB in [0, 1], (..., T, H, W, 3), T >= 2; or videos (T, H, W, 3) of one shape, which need no copy in one place.
         preset: `ultrafast`, `fast` or `medium`.
         threads: Number of threads; the number of cores where absent.
 
@@ -52,12 +52,17 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
     """
     if preset not in PRESETS:
         raise UserError(f"flow preset = {preset!r}; one of {', '.join(PRESETS)}")
-    if images.ndim < 4 or images.shape[-1] != 3 or images.shape[-4] < 2:
-        raise UserError(f"flow needs videos (..., T, H, W, 3) of at least 2 frames, got {tuple(images.shape)}")
-    if min(images.shape[-3:-1]) < 16:
-        raise UserError(f"flow needs images of at least 16 pixels a side, got {images.shape[-2]} x {images.shape[-3]}")
-    weights = images.new_tensor([0.299, 0.587, 0.114])
-    videos = images.detach().flatten(0, -5) if images.ndim > 4 else images.detach()[None]
+    leading = images.shape[:-4] if isinstance(images, Tensor) else (len(images),)
+    if isinstance(images, Tensor):
+        videos = list(images.detach().reshape(-1, *images.shape[-4:])) if images.ndim > 3 else [images]
+    else:
+        videos = [video.detach() for video in images]
+    first = videos[0]
+    if first.ndim != 4 or first.shape[-1] != 3 or len(first) < 2:
+        raise UserError(f"flow needs videos (..., T, H, W, 3) of at least 2 frames, got {(*leading, *first.shape)}")
+    if min(first.shape[1:3]) < 16:
+        raise UserError(f"flow needs images of at least 16 pixels a side, got {first.shape[2]} x {first.shape[1]}")
+    weights = first.new_tensor([0.299, 0.587, 0.114])
 
     def grey_of(frames: Tensor) -> np.ndarray:
         return (255 * (frames @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
@@ -67,12 +72,12 @@ def optical_flow(images: Tensor, *, preset: str = "medium", threads: int | None 
         search = cv2.DISOpticalFlow_create(PRESETS[preset])
         return [search.calc(a, b, None) for a, b in zip(grey[first:last], grey[first + 1 : last + 1])]
 
-    count, workers = images.shape[-4] - 1, threads or os.cpu_count() or 1
+    count, workers = len(first) - 1, threads or os.cpu_count() or 1
     share = max(1, count * len(videos) // (2 * workers))  # pairs of frames of a task: about two tasks a thread
     with ThreadPoolExecutor(workers) as pool:  # OpenCV releases the GIL
         parts = [(grey, k, min(k + share, count)) for grey in pool.map(grey_of, videos) for k in range(0, count, share)]
         flows = np.stack([flow for found in pool.map(pairs, parts) for flow in found])
-    return torch.from_numpy(flows).view(*images.shape[:-4], count, *flows.shape[1:])
+    return torch.from_numpy(flows).view(*leading, count, *flows.shape[1:])
 
 
 class Velocities(NamedTuple):
@@ -109,8 +114,8 @@ def body_window(masks: Tensor, margin: float = 0.1) -> tuple[int, int, int]:
 
 
 def measure_velocities(
-    images: Tensor,
-    masks: Tensor,
+    images: Tensor | Sequence[Tensor],
+    masks: Tensor | Sequence[Tensor],
     times: Tensor | Sequence[float],
     cameras: Cameras,
     centre: Tensor,
@@ -122,8 +127,8 @@ def measure_velocities(
     """Measure the velocities in videos within a square around the body, masked by its silhouette.
 
     Args:
-        images: RGB in [0, 1], (V, T, H, W, 3).
-        masks: Coverage of each pixel by the body, (V, T, H, W); ones if unknown.
+        images: RGB in [0, 1], (V, T, H, W, 3), or V videos.
+        masks: Coverage of each pixel by the body, (V, T, H, W), or V videos; ones if unknown.
         times: Evenly spaced times [s], (T,).
         cameras: Cameras of the V views.
         centre: Centre of the body [m], (3,).
@@ -137,13 +142,14 @@ def measure_velocities(
     interval, pixel = frame_interval_of(times), pixel_length(cameras, centre)
     path = None
     if cache is not None:
-        key = hashlib.sha256(repr((tuple(images.shape), preset, size)).encode())
-        for t in (images, masks):
-            key.update(as_bytes(t).cpu().numpy())
+        key = hashlib.sha256(repr(((len(images), *images[0].shape), preset, size)).encode())
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for part in pool.map(lambda video: as_bytes(video[None]).cpu().numpy(), [*images, *masks]):
+                key.update(part)
         path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
     found = _read_cache(path)
     if found is None:
-        found = _crop_flow(optical_flow(images, preset=preset), masks.cpu(), size)
+        found = _crop_flow(optical_flow(images, preset=preset), masks, size)
         if path is not None:
             write_arrays(path, {"flow": found[0].numpy(), "side": found[1].numpy()}, compressed=False)
     flow, side = found
@@ -172,10 +178,11 @@ def as_bytes(images: Tensor) -> Tensor:
     return out
 
 
-def _crop_flow(flow: Tensor, masks: Tensor, size: int) -> tuple[Tensor, Tensor]:
+def _crop_flow(flow: Tensor, masks: Tensor | Sequence[Tensor], size: int) -> tuple[Tensor, Tensor]:
     """Return the masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
     for each, mask in zip(flow, masks):
+        mask = mask.cpu()
         top, left, side = body_window(mask)
         cut = (slice(None), slice(top, top + side), slice(left, left + side))
         part = (each[cut] * mask[:-1][cut][..., None]).permute(0, 3, 1, 2)
