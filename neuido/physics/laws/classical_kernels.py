@@ -25,6 +25,22 @@ FLAT = 0.1
 """det F below which the stretch is computed from the principal frame, since `warp_functions.Functions.stretch` needs det F > 0."""
 
 
+_WARP_SUM = """
+#if defined(__CUDA_ARCH__)
+    const unsigned active = __activemask();
+    int alike = 0;
+    __match_all_sync(active, key, &alike);
+    if (active != 0xffffffffu || !alike) return value;
+    auto sum = value;
+    #pragma unroll
+    for (int d = 16; d > 0; d >>= 1) sum += __shfl_xor_sync(active, sum, d);
+    return (threadIdx.x & 31) == 0 ? sum : decltype(sum)(0);
+#else
+    return value;
+#endif
+"""
+
+
 class LawFunctions(NamedTuple):
     """Warp functions of one particle for one scalar type; the law is given by its number and its parameters."""
 
@@ -36,6 +52,8 @@ class LawFunctions(NamedTuple):
     """(F, kind, parameter) -> corrected F"""
     correction_gradient: Any
     """(F, kind, parameter, adjoint of the corrected F) -> adjoints of F and of the parameter"""
+    warp_sum: Any
+    """(value, key) -> on a GPU its sum over the warp in the first lane and zero in the others, if all have the same key; else the value"""
 
 
 class LawKernels(NamedTuple):
@@ -81,6 +99,9 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
     frame, compose, bounded, hencky = own.frame, own.compose, own.bounded, own.hencky
     inverse_stretch, log_difference, stretch = own.inverse_stretch, own.log_difference, own.stretch
     series_limit, log_stretch, exp_minus_one = own.series_limit, own.log_stretch, own.exp_minus_one
+
+    @wp.func_native(_WARP_SUM)
+    def warp_sum(value: real, key: wp.int32) -> real: ...
 
     @wp.func
     def corotated_in_frame(Fp: mat, mu: real, lam: real):
@@ -208,8 +229,11 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         grad, shear, bulk = stress_gradient(F[p], kinds[s], params[s, 0], params[s, 1], grad_tau[p])
         grad_F[p] = grad_F[p] + grad
         if grad_params:
-            wp.atomic_add(grad_params, s, 0, shear)
-            wp.atomic_add(grad_params, s, 1, bulk)
+            shear = warp_sum(shear, s)
+            bulk = warp_sum(bulk, s)
+            if shear != zero or bulk != zero:
+                wp.atomic_add(grad_params, s, 0, shear)
+                wp.atomic_add(grad_params, s, 1, bulk)
 
     @wp.func
     def limit(q: real, trace: real, kind: wp.int32, param: real):
@@ -357,8 +381,9 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         grad, share = correction_gradient(F[p], kinds[s], params[s, 0], grad_corrected[p])
         grad_F[p] = grad_F[p] + grad
         if grad_params:
+            share = warp_sum(share, s)
             if share != zero:
                 wp.atomic_add(grad_params, s, 0, share)
 
-    functions = LawFunctions(stress_of, stress_gradient, corrected_of, correction_gradient)
+    functions = LawFunctions(stress_of, stress_gradient, corrected_of, correction_gradient, warp_sum)
     return LawKernels(stress, stress_adjoint, correct, correct_adjoint, functions)

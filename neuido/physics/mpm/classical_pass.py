@@ -28,8 +28,8 @@ def build(real: type, corrects: bool, turns: int) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
     law, move = classical_kernels.kernels(real).functions, particle_functions.functions(real, name, turns)
-    stress_of, stress_gradient, correct, correction_gradient = law
-    gather, watch, scatter, warp_sum = move.gather, move.watch, move.scatter, move.warp_sum
+    stress_of, stress_gradient, correct, correction_gradient, warp_sum = law
+    gather, watch, scatter = move.gather, move.watch, move.scatter
     gather_adjoint, scatter_adjoint = move.gather_adjoint, move.scatter_adjoint
     mat33 = move.mat33
     reals, ints, tables = wp.array(dtype=real), wp.array(dtype=wp.int32), wp.array2d(dtype=real)
@@ -37,7 +37,7 @@ def build(real: type, corrects: bool, turns: int) -> SimpleNamespace:
 
     @func
     def add_share(shares: tables, warp: int, column: int, value: real):
-        total = warp_sum(value)
+        total = warp_sum(value, 0)
         if total != real(0.0):
             wp.atomic_add(shares, warp, column, total)
 

@@ -30,14 +30,33 @@ def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
     own, layers, move = fused.readout(kind, name), fused.networks(width, name), particle_functions.functions(wp.float32, name, turns)
-    strain_invariants, features_of, stress_of = own.strain_invariants, own.features_of, own.value
+    features_of, stress_of = own.features_of, own.value
     stress_coefficients, stress_gradient = own.coefficients, own.gradient
-    network, network_adjoint, outputs = layers.network, layers.network_adjoint, layers.outputs
+    inner, inner_adjoint, inner_invariants, outputs = layers.network, layers.network_adjoint, own.strain_invariants, layers.outputs
     gather, watch, scatter = move.gather, move.watch, move.scatter
     gather_adjoint, scatter_adjoint = move.gather_adjoint, move.scatter_adjoint
-    vec3, vec4, mat33 = move.vec3, move.vec4, move.mat33
+    vec3, vec4, mat33, vec9, vecK = move.vec3, move.vec4, move.mat33, own.vec9, layers.vecK
     floats, ints = wp.array(dtype=wp.float32), wp.array(dtype=wp.int32)
     vectors, quads, matrices = wp.array(dtype=vec3), wp.array(dtype=vec4), wp.array(dtype=mat33)
+
+    # called, and not written out at each call: a warp runs its code once, so that fetching it takes longer than running it
+    shared_code = functools.partial(wp.func, module=name, inline=False)
+
+    @shared_code
+    def strain_invariants(F: mat33):
+        N, h, l, A, q = inner_invariants(F)
+        return N, h, l, A, q
+
+    @shared_code
+    def network(x: vec9, shared: int, scene: int, W1: floats, W2: floats, B2: floats, W3: floats, B3: floats):
+        return inner(x, shared, scene, W1, W2, B2, W3, B3)
+
+    @shared_code
+    def network_adjoint(
+        x: vec9, kept: vecK, gy: vec4, shared: int, scene: int, W1: floats, W2T: floats, W3T: floats, W1T: floats,
+        warp: int, first: int, last: int, P3: floats, PB: floats, none: floats,
+    ):  # fmt: skip
+        return inner_adjoint(x, kept, gy, shared, scene, W1, W2T, W3T, W1T, warp, first, last, P3, PB, none, none, none)
 
     if corrects:
         plastic = fused.correction(own, name)
@@ -63,7 +82,7 @@ def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
             if live == 0:
                 gy = vec4(0.0, 0.0, 0.0, 0.0)
             gx = network_adjoint(x, k, gy, wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2T, W3T, W1T, warp, first, last, P3, PB,
-                                 none, none, none)  # fmt: skip
+                                 none)  # fmt: skip
             N2, h2, l2, A2, q2 = strain_invariants(F)
             return correction_gradient(F, N2, h2, l2, A2, q2, outputs(k), scale, g, gx)
 
@@ -157,7 +176,7 @@ def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
         if live == 0:
             gy = vec4(0.0, 0.0, 0.0, 0.0)
         gx = network_adjoint(features, k, gy, wp.min(s, shared - 1), wp.min(s, rows - 1), W1, W2T, W3T, W1T, warp, first, last, P3, PB,
-                             none, none, none)  # fmt: skip
+                             none)  # fmt: skip
         # computed again, since keeping it would cost registers
         N2, h2, l2, A2, q2 = strain_invariants(F[p])
         aF = a_F[p] + stress_gradient(F[p], N2, h2, l2, A2, q2, outputs(k), scale, a_tau, gx)

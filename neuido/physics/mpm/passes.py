@@ -12,17 +12,17 @@ from neuido.physics.laws.neural import fused
 from neuido.physics.laws.parametric import ParametricLaw
 from neuido.physics.mpm import classical_pass, network_pass
 from neuido.physics.mpm.kernels import transfer_pass
-from neuido.physics.mpm.kernels.tile_source import UNROLLED
+from neuido.physics.mpm.kernels.tile_source import ROLLED, UNROLLED
 from neuido.physics.mpm.plan import FIXED, LARGE, STATES, Plan
 from neuido.physics.runtime.device import real_of
 
 VISCOSITY = STATES + 4
 """Index of the input of viscous stress."""
 
-TURNS = UNROLLED
-"""Turns of the loops over nodes that are written out."""
+TURNS: int | None = None
+"""Turns of the loops over nodes that are written out; None: `ROLLED` for fewer than `LARGE` particles, else `UNROLLED`."""
 
-BY_DEFAULT: dict[str, str] = {}
+BY_DEFAULT = {"cuda": "fused"}
 """The kernels that `fusion="auto"` takes on each type of device; `separate` on others."""
 
 
@@ -131,10 +131,17 @@ class Pass:
         return [*self.elastic.gradients(), *(() if self.plastic is None else self.plastic.gradients())]
 
 
-def choose(plan: Plan, inputs: Sequence[Tensor]) -> Pass | None:
+def _turns(plan: Plan) -> int:
+    if TURNS is not None:
+        return TURNS
+    return ROLLED if len(plan.setup.mass) < LARGE else UNROLLED
+
+
+def choose(plan: Plan, inputs: Sequence[Tensor], *, backward: bool = False) -> Pass | None:
     """Return the launches of the particles for a rollout; None where the kernels of `transfers` must run.
 
-    Effects, solids, attachments, bodies that meet, and faces through which particles leave need those.
+    Effects, solids, attachments, bodies that meet, and faces through which particles leave need those. The adjoints of networks run by
+    themselves for many particles, since one kernel of both leaves a multiprocessor too few warps.
     """
     setup = plan.setup
     fusion = setup.fusion
@@ -147,7 +154,7 @@ def choose(plan: Plan, inputs: Sequence[Tensor]) -> Pass | None:
     if fusion == "fused":
         if _are_classical(plan):
             return ClassicalPass(plan, inputs)
-        if _are_networks(plan):
+        if _are_networks(plan) and not (backward and len(setup.mass) >= LARGE):
             return NetworkPass(plan, inputs)
     return TransferPass(plan, inputs)
 
@@ -173,7 +180,7 @@ class TransferPass(Pass):
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         super().__init__(plan, inputs)
         self.elastic, self.plastic = plan.engines(inputs)
-        self.kernels = transfer_pass.build(real_of(plan.setup.dtype), TURNS)
+        self.kernels = transfer_pass.build(real_of(plan.setup.dtype), _turns(plan))
         self.block = 32 if len(plan.setup.mass) < LARGE else 128
         self.spare = [torch.empty_like(plan.setup.state.F) for _ in range(2)]
 
@@ -220,7 +227,7 @@ class NetworkPass(Pass):
         elastic, plastic = plan.elasticity, plan.plasticity
         self.elastic = fused.FusedEngine(elastic, inputs[FIXED : plan.split], particles)
         self.plastic = None if plastic is None else fused.FusedEngine(plastic, inputs[plan.split :], particles)
-        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, self.corrects, TURNS)  # type: ignore[attr-defined]
+        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, self.corrects, _turns(plan))  # type: ignore[attr-defined]
 
     def _packed(self, engine: fused.FusedEngine | None) -> list:
         if engine is None:
@@ -249,7 +256,7 @@ class ClassicalPass(Pass):
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         super().__init__(plan, inputs)
         self.elastic, self.plastic = plan.engines(inputs)
-        self.kernels = classical_pass.build(real_of(plan.setup.dtype), self.corrects, TURNS)
+        self.kernels = classical_pass.build(real_of(plan.setup.dtype), self.corrects, _turns(plan))
         self.block = 32 if len(plan.setup.mass) < LARGE else 128
 
     def _law(self, engine: Engine | None) -> list:

@@ -69,7 +69,7 @@ def run_backward(
     plan: Plan, inputs: Sequence[Tensor], tape: Tape, gradients: Sequence[Tensor | None], wanted: Sequence[bool], steps: int | None = None
 ) -> list[Tensor | None]:
     """Compute the gradients of a rollout by the kernels that suit it; arguments and result as for `adjoint.run_backward`."""
-    own = choose(plan, inputs)
+    own = choose(plan, inputs, backward=True)
     if own is None or tape.tau is None or tape.grid is None or not own.differentiates(wanted):
         return adjoint.run_backward(plan, inputs, tape, gradients, wanted, steps)
     with torch_stream(plan.setup.device):

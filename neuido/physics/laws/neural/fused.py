@@ -95,7 +95,7 @@ def networks(width: int, name: str) -> SimpleNamespace:
     def outputs(k: vecK):
         return vec4(k[wp.static(kept - 4)], k[wp.static(kept - 3)], k[wp.static(kept - 2)], k[wp.static(kept - 1)])
 
-    return SimpleNamespace(network=network, network_adjoint=network_adjoint, outputs=outputs)
+    return SimpleNamespace(network=network, network_adjoint=network_adjoint, outputs=outputs, vecK=vecK)
 
 
 @cached

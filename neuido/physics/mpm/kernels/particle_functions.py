@@ -44,9 +44,6 @@ def functions(real: type, name: str, turns: int) -> SimpleNamespace:
             b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, live: int,
         ): ...  # fmt: skip
 
-        @wp.func_native(tile_source.WARP_SUM)
-        def warp_sum(value: real) -> real: ...
-
     else:
         moments, plain_spread = own.moments, own.spread
 
@@ -61,10 +58,6 @@ def functions(real: type, name: str, turns: int) -> SimpleNamespace:
         ):  # fmt: skip
             if live == 1:
                 plain_spread(grid, (nx * size_y + ny) * size_z + nz, size_y, size_z, wx, wy, wz, b, ax, ay, az, mass, 0)
-
-        @func
-        def warp_sum(value: real):
-            return value
 
     @func
     def place(x: vec3, s: int, origin: wp.array(dtype=vec3), dx: wp.array(dtype=real), nodes: wp.vec3i):
@@ -259,5 +252,5 @@ def functions(real: type, name: str, turns: int) -> SimpleNamespace:
 
     return SimpleNamespace(
         vec3=vec3, vec4=vec4, mat33=mat33, gather=gather, watch=watch, scatter=scatter, scatter_adjoint=scatter_adjoint,
-        gather_adjoint=gather_adjoint, warp_sum=warp_sum,
+        gather_adjoint=gather_adjoint,
     )  # fmt: skip
