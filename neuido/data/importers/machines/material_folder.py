@@ -112,6 +112,11 @@ def write_material_tests(
     tests = [test | {"role": roles[test["name"]]} for test in tests]
     if len(tests) > 1:
         summary.append(f"held out: {', '.join(name for name, role in roles.items() if role == 'held_out') or 'none'} (--held_out NAMES)")
+    if not material.young and not np.isfinite(np.median(secants)):
+        names = ", ".join(path.name for path in files.values())
+        raise UserError(
+            f"{names}: stress over strain of the first rows is {np.median(secants):g} Pa: a number is too large, or give --young"
+        )
     model, words = declared_fluid(material, secants) if all(fluids) else declared_model(material, secants)
     summary += words
     content = {"format": "neuido-material-test/1", "name": next(iter(files)), "model": model, "tests": tests}
