@@ -198,6 +198,11 @@ class Problem:
         """
         return np.empty((len(self.recordings[recording].y), 0))
 
+    def shown(self, point: Point, p: Parameter) -> tuple[float, float]:
+        """Return the range of a declared figure that slow and fast measurements show; its value, twice, where time has no part in it."""
+        value = point.get(p.name, p.value)
+        return value, value
+
     def instrument_errors(self, point: Point, recording: int) -> np.ndarray:
         """Return how one standard deviation of each error of the instruments that no nuisance has changes a recording, (n, k).
 

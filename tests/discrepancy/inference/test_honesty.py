@@ -186,7 +186,7 @@ def test_a_declared_figure_far_off_is_a_finding_where_the_data_tell_it(value, co
     """`cost`: of a unit of the figure."""
     (young,) = Line({"young": 1.5}).declared
     young = replace(young, value=1.0)
-    problem = SimpleNamespace(declared=(young,))
+    problem = SimpleNamespace(declared=(young,), shown=lambda point, p: (point[p.name], point[p.name]))
     lab = SimpleNamespace(problem=problem, costs=lambda points, floor: [cost * (p["young"] - value) ** 2 for p in points])
     at = SimpleNamespace(fit=SimpleNamespace(point={"young": value}), floor=None)
     assert bool(findings(lab, at)) is told

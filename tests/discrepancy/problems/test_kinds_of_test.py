@@ -141,3 +141,14 @@ def test_stress_and_strain_do_not_share_a_folder(tmp_path):
     test = {"name": "a", "mode": "simple_shear", "columns": SHEAR}
     with pytest.raises(UserError, match="two folders"):
         read_material_tests(folder(tmp_path, SOLID, [test, test | {"name": "b", "control": "stress"}], t=t, g=0.01 * t, s=1e3 * t))
+
+
+def test_what_relaxes_stiffens_a_fast_test(tmp_path):
+    """So that a soft base law with a strong relaxation is no other material than the declared one."""
+    t = np.geomspace(0.1, 100.0, 40)
+    problem = MaterialProblem(
+        folder(tmp_path, SOLID, [{"name": "a", "mode": "simple_shear", "columns": SHEAR}], t=t, g=0.01 * t, s=t * MU / 100)
+    )
+    (young,) = problem.declared
+    point = {"young": 5e3, "maxwell.ratio": 50.0, "maxwell.time": 1.0}
+    assert problem.shown(point, young) == pytest.approx((5e3, 51 * 5e3)) and problem.shown({"young": 5e3}, young) == (5e3, 5e3)

@@ -108,7 +108,8 @@ def findings(lab: Laboratory, at: Stand) -> list[str]:
         ends = [
             side for side in ("lower", "upper") if FREE_AT.get(p.name) != side and _is_at(p, value, side) and not _is_at(p, p.value, side)
         ]
-        ratio = max(value / p.value, p.value / value) if p.log else 1.0
+        near = min(max(p.value, min(shown := lab.problem.shown(point, p))), max(shown))
+        ratio = max(near / p.value, p.value / near) if p.log else 1.0
         if not ends and ratio <= IMPLAUSIBLE:
             continue
         back = {**point, p.name: min(max(value, p.value / IMPLAUSIBLE), p.value * IMPLAUSIBLE) if ratio > IMPLAUSIBLE else p.value}

@@ -10,7 +10,7 @@ import torch
 
 from neuido.data.measured.material_test import CURVES, MaterialTest, MaterialTests, read_material_tests
 from neuido.discrepancy.problems.declared_model import declared
-from neuido.discrepancy.problems.problem import Point, Problem, Recording
+from neuido.discrepancy.problems.problem import Parameter, Point, Problem, Recording
 from neuido.discrepancy.problems.specimens.material_candidates import material_candidates
 from neuido.discrepancy.problems.specimens.repeats import noise_of, scatter, stiffness
 from neuido.errors import UserError
@@ -141,6 +141,16 @@ class MaterialProblem(Problem):
             sections.append(section)
         elasticity, plasticity = material(*sections)
         return Specimen(elasticity, plasticity, Effects.of(self._effects(points)), len(points), self.tests.incompressible)
+
+    def shown(self, point: Point, p: Parameter) -> tuple[float, float]:
+        """Return Young's modulus of a slow and of a fast test: what relaxes stiffens the law at once."""
+        slow, fast = super().shown(point, p)
+        if p.name != "young" or self.tests.fluid:
+            return slow, fast
+        law = self._specimen([point]).law()
+        if law.tables.branches is None:
+            return slow, fast
+        return slow, fast * (1 + float(0.5 * law.tables.branches[0, :, 0].sum() / law.shear()[0]))
 
     def model_after(self, values: Point, effects: Sequence[str]) -> dict[str, Any]:
         model: dict[str, Any] = {key: dict(part) if isinstance(part, dict) else part for key, part in self.tests.model.items()}
