@@ -25,6 +25,8 @@ CLOCK = re.compile(
     r"(?: ?(?:Z|UTC|[+-]\d\d:?\d\d|(?P<half>[AaPp])\.?[Mm]\.?))?"
 )
 """Time as hours:minutes:seconds or minutes:seconds, with a date before it, and hundredths of a second or frames after it."""
+BROKEN, WORD = 2.0, 1.5
+"""What a cell that begins like a number and is none takes from the score of a dialect, and what a word takes; a name may be a column."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -122,8 +124,9 @@ def _dialect(lines: list[str]) -> tuple[str, str]:
                 cells = [cell for cell in _split(line, separator) if cell]
             except csv.Error:
                 continue
-            numbers = sum(_in_dialect(cell, decimal) or CLOCK.fullmatch(cell) is not None for cell in cells)
-            score += numbers - 2 * (len(cells) - numbers) if numbers else 0
+            others = [cell for cell in cells if not _in_dialect(cell, decimal) and CLOCK.fullmatch(cell) is None]
+            numbers = len(cells) - len(others)
+            score += numbers - sum(BROKEN if cell[0] in "+-.,0123456789" else WORD for cell in others) if numbers else 0
         if score > best:
             best, chosen = score, (separator, decimal)
     if best > 0:
