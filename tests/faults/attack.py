@@ -273,7 +273,7 @@ def _forked(
             break
         used, sleeps = _processor_seconds(child)
         if used > before or not sleeps:
-            before, awake = used, time.monotonic()
+            before, awake = max(used, before), time.monotonic()
         if end is None and used > STOP:
             os.kill(child, signal.SIGTERM)
             told, end = used, time.monotonic() + 4 * GRACE
@@ -289,7 +289,12 @@ def _forked(
         os.close(reads)
     status = os.waitstatus_to_exitcode(code)
     found = json.loads(texts[2] or b"[]")
-    return (None if status == -signal.SIGKILL else status), usage.ru_utime + usage.ru_stime, texts[1].decode(errors="replace"), found
+    return (
+        (None if status == -signal.SIGKILL else status),
+        max(usage.ru_utime + usage.ru_stime, before),
+        texts[1].decode(errors="replace"),
+        found,
+    )
 
 
 def _processor_seconds(pid: int) -> tuple[float, bool]:
