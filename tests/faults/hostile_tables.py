@@ -135,7 +135,7 @@ def units() -> Iterator[Hostile]:
     for unit in ("kg", "m/s", "mm^99"):
         yield text("unit", f"positions in {unit}", TRACK, units={"x": unit})
         yield text("unit", f"times in {unit}", TRACK, units={"time": unit})
-    yield text("unit", "different units of axes", ["t (s),x (mm),y (m)", *TRACK[1:]])
+    yield text("unit", "an axis without a unit", ["t (s),x (mm),y", *TRACK[1:]])
     yield text("unit", "no unit of a force", column("Extension (mm)", list(range(20)), "Force"), specimen=Specimen("9 mm", "9 mm", "9 mm"))
 
 
