@@ -20,7 +20,8 @@ VISCOSITY = STATES + 4
 """Index of the input of viscous stress."""
 
 TURNS: int | None = None
-"""Turns of the loops over nodes that are written out; None: `ROLLED` for fewer than `LARGE` particles, else `UNROLLED`."""
+"""Turns of the loops over nodes that are written out; None: `UNROLLED` on CUDA, where it is faster, and `ROLLED` on the CPU, which compiles
+it sooner."""
 
 BY_DEFAULT = {"cuda": "fused"}
 """The kernels that `fusion="auto"` takes on each type of device; `separate` on others."""
@@ -134,13 +135,13 @@ class Pass:
 def _turns(plan: Plan) -> int:
     if TURNS is not None:
         return TURNS
-    return ROLLED if len(plan.setup.mass) < LARGE else UNROLLED
+    return UNROLLED if plan.setup.device.type == "cuda" else ROLLED
 
 
 def choose(plan: Plan, inputs: Sequence[Tensor], *, backward: bool = False) -> Pass | None:
     """Return the launches of the particles for a rollout; None where the kernels of `transfers` must run.
 
-    Effects, solids, attachments, bodies that meet, and faces through which particles leave need those. The adjoints of networks run by
+    Effects, solids, attachments, bodies that meet, and faces through which particles leave need those. The adjoints of laws run by
     themselves for many particles, since one kernel of both leaves a multiprocessor too few warps.
     """
     setup = plan.setup
@@ -151,10 +152,10 @@ def choose(plan: Plan, inputs: Sequence[Tensor], *, backward: bool = False) -> P
     alone = setup.contact is None and setup.solids is None and setup.attached is None and setup.leaving is None
     if fusion == "separate" or not plain or not alone or len(setup.field_scene) > setup.scene_count:
         return None
-    if fusion == "fused":
+    if fusion == "fused" and not (backward and len(setup.mass) >= LARGE):
         if _are_classical(plan):
             return ClassicalPass(plan, inputs)
-        if _are_networks(plan) and not (backward and len(setup.mass) >= LARGE):
+        if _are_networks(plan):
             return NetworkPass(plan, inputs)
     return TransferPass(plan, inputs)
 

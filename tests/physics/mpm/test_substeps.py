@@ -150,7 +150,8 @@ def test_effects_run_by_parts():
     laws = classical(FixedCorotated, VonMises)
     effects = Effects(drag_linear=0.4, viscosity_shear=5.0)
     results = [run(simulator(fusion, WALLS["slip"], torch.float64), laws, effects=effects)[0] for fusion in ("fused", "separate")]
-    assert all(torch.equal(a, b) for a, b in zip(*results))
+    for a, b in zip(*results):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)  # a GPU adds in any order
 
 
 def test_a_wrong_name_is_refused():
