@@ -1,6 +1,8 @@
 """Faulty recordings that people sent, read where NEUIDO_DATA has them: the right value of each, or the line that says what is wrong."""
 
+import json
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from neuido.data.formats.gaussian_ply import read_gaussian_vertices
 from neuido.data.scenes.filmed_scene import load_views
 from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
+from tests.command import run
 
 CASES = Path(os.environ.get("NEUIDO_DATA", "")) / "cases"
 pytestmark = pytest.mark.skipif(not os.environ.get("NEUIDO_DATA") or not CASES.is_dir(), reason="NEUIDO_DATA has no folder cases")
@@ -28,9 +31,48 @@ def test_share_of_the_object(number, width):
     assert width != 100 or batch.images.shape[2:4] == (74, 100)
 
 
-def test_pincushion_without_a_mask():
+def test_pincushion_without_a_mask(tmp_path):
+    """The masks are about those of the same images without distortion."""
     masks = load_views(case(2)).masks
-    assert float(masks[..., 0, :].max()) == 0 and float(masks.mean()) < 0.2
+    shutil.copytree(case(2) / "images", tmp_path / "images")
+    content = json.loads((case(2) / "transforms.json").read_text())
+    (tmp_path / "transforms.json").write_text(json.dumps(content | {"k1": 0.0}))
+    assert float(masks[..., 0, :].max()) == 0
+    assert float(masks.mean()) == pytest.approx(float(load_views(tmp_path).masks.mean()), rel=0.05)
+
+
+@pytest.fixture
+def copied(tmp_path, capsys, monkeypatch):
+    """Run `reconstruct` on a copy of a case, which it may write into; return its report."""
+
+    def reconstructed(number: int) -> dict:
+        for part in ("images", "transforms.json"):
+            own = case(number) / part
+            (shutil.copytree if own.is_dir() else shutil.copy)(own, tmp_path / part)
+        monkeypatch.chdir(tmp_path)
+        sizes = ["--steps", "40", "--start", "400", "--gaussians", "400", "--particles", "500", "--resolution", "24"]
+        status, _, said = run(capsys, "reconstruct", ".", *sizes, "--velocity", "[0,-1.9,0]")
+        assert status == 0, said
+        return json.loads(Path("reconstruction/report.json").read_text())
+
+    return reconstructed
+
+
+@pytest.mark.slow
+def test_pincushion_keeps_the_volume(copied):
+    assert copied(2)["volume"] == pytest.approx(0.034, rel=0.05)
+
+
+@pytest.mark.slow
+def test_thirty_frames_a_second_are_predicted(copied, capsys):
+    """With the default step, which 1/30 s does not divide."""
+    copied(11)
+    status, _, said = run(capsys, "predict", "--config", "predict", "--model.init_from", "pretrained-small", "--data.scenes", "[.]")
+    assert status == 0, said
+    (result,) = Path("runs/predict").iterdir()
+    rows = (result / "particles" / "times.csv").read_text().splitlines()
+    assert [float(row.split(",")[-1]) for row in rows[1:]] == pytest.approx(read_recording(case(11)).times.tolist())
+    assert len(list(result.glob("particles/*.ply"))) == len(rows) - 1
 
 
 @pytest.mark.parametrize(("number", "focal"), [(4, (110.0, 150.0)), (8, (110.0, None)), (9, (110.0, 110.0)), (10, (110.0, 110.0))])
