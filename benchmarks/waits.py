@@ -169,7 +169,7 @@ def imports(bench: Bench) -> list[Row]:
     repeat = 1 if bench.options.small else 3
     cases = {
         "import neuido": "import neuido", "import torch": "import torch",
-        "import neuido.physics": "import neuido; neuido.physics.Simulator",
+        "import neuido.physics": "import neuido.physics; neuido.physics.Simulator",
         "neuido fit --help": "import sys; from neuido.commands.main import main; main(['fit', '--help'])",
     }  # fmt: skip
     return [Row(name, statistics.median(in_a_process(code)[0] for _ in range(repeat)), repeat) for name, code in cases.items()]
@@ -189,7 +189,8 @@ simulator = Simulator(Scene(cells={cells}, dt=2e-4), body, device="{device}")
 wp.config.log_level = wp.LOG_INFO
 young = torch.tensor([1e5], device="{device}", requires_grad=True)
 operator = IntrinsicDynamicsOperator.load("pretrained").to("{device}").eval()
-laws = operator.laws(operator.latents.mean(0).clone().requires_grad_()) if "{law}" == "learned" else (FixedCorotated(young, 0.3), None)
+z = operator.latents.mean(0).to("{device}").requires_grad_()
+laws = operator.laws(z) if "{law}" == "learned" else (FixedCorotated(young, 0.3), None)
 start = time.perf_counter()
 with torch.no_grad():
     print("#moved", float(simulator.rollout(5, *laws, check=False).x[-1].sum()) != 0)

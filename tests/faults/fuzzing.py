@@ -16,7 +16,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -202,7 +202,7 @@ def damage(reader: Reader, folder: Path, files: list[Path], number: int) -> tupl
     return path, kind
 
 
-def fuzz(reader: Reader, folder: Path, numbers: range, *, stop: float | None = None) -> tuple[list[Fault], int, float]:
+def fuzz(reader: Reader, folder: Path, numbers: Iterable[int], *, stop: float | None = None) -> tuple[list[Fault], int, float]:
     """Read damaged versions of a reader's sample.
 
     Args:

@@ -112,7 +112,7 @@ def test_public_names_are_found_and_listed():
     assert set(neuido.models.__all__) <= set(dir(neuido.models))
     for name in neuido.models.__all__:
         assert getattr(neuido.models, name) is not None
-    with pytest.raises(AttributeError, match="no attribute 'Nothing'"):
+    with pytest.raises(AttributeError, match=r"No neuido\.models attribute Nothing"):
         neuido.models.Nothing  # noqa: B018
 
 

@@ -3,11 +3,12 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from neuido.data.files.parsing import parser_errors
+from neuido.data.importers.fields.matlab_file import read_variable
 from neuido.data.importers.tables.titled_tables import read_titled
 from neuido.data.importers.tables.titles import bare_title
 from neuido.errors import UserError
@@ -81,22 +82,21 @@ def _text(path: Path) -> Field:
 
 
 def _ncorr(path: Path) -> list[Field]:
-    from scipy.io import loadmat
-
     if not path.is_file():
         raise UserError(f"{path} is missing")
     with parser_errors(path, "MATLAB file of Ncorr"):
-        content = loadmat(path, variable_names=["data_dic_save"], squeeze_me=True, struct_as_record=False)
-        if "data_dic_save" not in content:
+        saved = read_variable(path, "data_dic_save")
+        if saved is None:
             raise UserError(f"{path} has no data_dic_save: save the analysis in Ncorr, as a MATLAB file of version 7")
-        saved = content["data_dic_save"]
-        factor = float(saved.dispinfo.pixtounits) * (int(saved.dispinfo.spacing) + 1)
-        images: list[Any] = list(np.atleast_1d(saved.displacements))
+        (parts,) = saved.parts("dispinfo", "displacements")
+        (info,) = parts["dispinfo"].parts("pixtounits", "spacing")
+        factor = info["pixtounits"].number() * (int(info["spacing"].number()) + 1)
         out = []
-        for image in images:
-            mask = np.atleast_2d(np.asarray(image.roi_ref_formatted.mask, bool))
-            u, v = (np.atleast_2d(np.asarray(part, float)) for part in (image.plot_u_ref_formatted, image.plot_v_ref_formatted))
-            if not mask.shape == u.shape == v.shape:
+        for image in parts["displacements"].parts("plot_u_ref_formatted", "plot_v_ref_formatted", "roi_ref_formatted"):
+            (region,) = image["roi_ref_formatted"].parts("mask")
+            mask = region["mask"].values().astype(bool)
+            u, v = (image[f"plot_{axis}_ref_formatted"].values().astype(float) for axis in "uv")
+            if not mask.shape == u.shape == v.shape or mask.ndim != 2:
                 raise UserError(f"{path}: mask and displacements of an image differ in shape: {mask.shape}, {u.shape}, {v.shape}")
             rows, columns = np.nonzero(mask)
             out.append(Field(factor * np.stack([columns, rows], 1).astype(float), np.stack([u[mask], v[mask]], 1), "Ncorr"))
