@@ -9,24 +9,25 @@ from neuido.data.files.parsing import one_line
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import check_limit
 
-DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","))
-"""Separators and decimal signs, the most likely first; a blank means any white space."""
+DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","), (",", ","))
+"""Separators and decimal signs, the most likely first; a blank means any white space. The last one is of numbers in quotation marks."""
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")  # each digit is matched in one way: no time grows with the square
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
 _MARKS = "'\u2019 \u00a0\u2009\u202f"
 """Marks between thousands in Switzerland, France and by SI; points and commas do so too."""
 _GROUPED = {
-    ".": re.compile(rf"[+-]?\d{{1,3}}(,\d{{3}})+(\.\d+)?|[+-]?\d{{1,3}}([{_MARKS}]\d{{3}})+(\.\d+)?"),
-    ",": re.compile(rf"[+-]?\d{{1,3}}(\.\d{{3}})+(,\d+)?|[+-]?\d{{1,3}}([{_MARKS}]\d{{3}})+(,\d+)?"),
+    ".": re.compile(rf"[+-]?[1-9]\d{{0,2}}((,\d{{3}})+|([{_MARKS}]\d{{3}})+)(\.\d+)?"),
+    ",": re.compile(rf"[+-]?[1-9]\d{{0,2}}((\.\d{{3}})+|([{_MARKS}]\d{{3}})+)(,\d+)?"),
 }
+"""Numbers with marks between thousands. None begins with 0, so that 0.125 is no 125."""
 CLOCK = re.compile(
     r"(?:(?P<date>\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}|\d{1,2}/\d{1,2}/\d{4}),?[T ] ?)?(?P<first>\d{1,2}):"
     r"(?P<second>\d\d(?:[.,]\d{1,9}(?!:))?)(?::(?P<third>\d\d(?:[.,]\d{1,9})?))?(?:(?P<mark>[:;])(?P<frames>\d\d))?"
     r"(?: ?(?:Z|UTC|[+-]\d\d:?\d\d|(?P<half>[AaPp])\.?[Mm]\.?))?"
 )
 """Time as hours:minutes:seconds or minutes:seconds, with a date before it, and hundredths of a second or frames after it."""
-BROKEN, WORD = 2.0, 1.5
-"""What a cell that begins like a number and is none takes from the score of a dialect, and what a word takes; a name may be a column."""
+BROKEN, WORD, THOUSANDS = 2.0, 1.5, 0.01
+"""What a cell takes from the score of a dialect: a broken number, a word (a name may be a column), and 1.250 read as 1250."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -76,18 +77,22 @@ def read_delimited(path: Path) -> Delimited:
 
 
 def _titles_in_comment(text: str, rows: list[list[str]], lines: list[int], separator: str) -> tuple[int, list[str]] | None:
-    """Return the line and the cells of the comment above a table without titles, `# t x y`, if it has as many cells as a row."""
+    """Return the line and the cells of the comment above a table without titles, `# t x y`, if it has as many cells as a row.
+
+    Other comments may stand between if it names t and x.
+    """
     if not rows or not all(is_number(cell) or CLOCK.fullmatch(cell) for cell in rows[0] if cell):
         return None
     above = [(i, line) for i, line in enumerate(text.splitlines()[: lines[0] - 1], 1) if line.strip()]
-    if not above:
-        return None
-    number, line = above[-1]
-    bare = line.strip().lstrip("#").strip()
-    for own in (separator, " ", ","):
-        cells = _split(bare, own) if own == " " or '"' not in bare else []
-        if len(cells) == len(rows[0]) and len(cells) > 1 and not any(is_number(cell) for cell in cells) and all(cells):
-            return number, cells
+    for nearest, (number, line) in enumerate(reversed(above)):
+        if nearest and not line.lstrip().startswith("#"):
+            return None
+        bare = line.strip().lstrip("#").strip()
+        for own in (separator, " ", ","):
+            cells = _split(bare, own) if own == " " or '"' not in bare else []
+            named = not nearest or {"t", "x"} <= {cell.lower() for cell in cells}
+            if named and len(cells) == len(rows[0]) and len(cells) > 1 and not any(is_number(cell) for cell in cells) and all(cells):
+                return number, cells
     return None
 
 
@@ -127,6 +132,9 @@ def _dialect(lines: list[str]) -> tuple[str, str]:
             others = [cell for cell in cells if not _in_dialect(cell, decimal) and CLOCK.fullmatch(cell) is None]
             numbers = len(cells) - len(others)
             score += numbers - sum(BROKEN if cell[0] in "+-.,0123456789" else WORD for cell in others) if numbers else 0
+            if (separator, decimal) != (",", "."):
+                mark, other = (".", NUMBER) if decimal == "," else (",", _COMMA)
+                score -= THOUSANDS * sum(mark in cell and other.fullmatch(cell) is not None for cell in cells)
         if score > best:
             best, chosen = score, (separator, decimal)
     if best > 0:

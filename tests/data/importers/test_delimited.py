@@ -8,17 +8,19 @@ from neuido.data.measured.material_test import read_material_tests
 from neuido.errors import UserError
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     dialect=st.sampled_from([(",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ",")]),
     encoding=st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
-    rows=st.lists(st.tuples(*[st.floats(-1e6, 1e6).map(lambda v: round(v, 4))] * 3), min_size=4, max_size=12),
+    rows=st.lists(st.tuples(*[st.one_of(st.floats(-1e6, 1e6), st.floats(-9, 9))] * 3), min_size=4, max_size=12),
+    digits=st.sampled_from([1, 3, 4]),
     preamble=st.lists(st.sampled_from(["# made on a Monday", "Prüfer: Müller", "mass_A"]), max_size=3),
     end=st.sampled_from(["\n", "\r\n"]),
 )
-def test_any_dialect(tmp_path_factory, dialect, encoding, rows, preamble, end):
+def test_any_dialect(tmp_path_factory, dialect, encoding, rows, digits, preamble, end):
     separator, decimal = dialect
-    lines = [separator.join(f"{v:.4f}".replace(".", decimal) for v in row) for row in rows]
+    rows = [[round(v, digits) for v in row] for row in rows]
+    lines = [separator.join(f"{v:.{digits}f}".replace(".", decimal) for v in row) for row in rows]
     path = tmp_path_factory.mktemp("dialect") / "data.csv"
     path.write_bytes(end.join([*preamble, separator.join("abc"), *lines, ""]).encode(encoding))
     table = read_delimited(path)

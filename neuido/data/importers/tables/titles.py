@@ -64,8 +64,8 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
 _UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|ms|s|sec|min|pixels?|px|deg|rad|°"
 UNIT_IN_TITLE = re.compile(rf"[(\[<]([^()\[\]<>]*)[)\]>]\s*$|(?:[\s_]in\s|\s*[/,;:]\s*|[\s_])({_UNITS})$")
 """The unit at the end of a title: in brackets, or after `in`, a slash, a comma or a blank."""
-POINT = re.compile(r"(?P<name>.*?\w)[ _.:-]*(?P<axis>[xyz])|(?P<first>[xyz])[ _.:-]*(?P<rest>\w.*)")
-"""Title of a coordinate of a named point: `ball_x`, `nose.y`, `Marker 3 Z`, `x1`, `X_ball`."""
+POINT = re.compile(r"(?P<name>.*?\w)[ _.:/-]*(?P<axis>[xyz])|(?P<first>[xyz])[ _.:-]*(?P<rest>\w.*)")
+"""Title of a coordinate of a named point: `ball_x`, `nose.y`, `Marker 3 Z`, `Marker 1/0/X`, `x1`, `X_ball`."""
 _NO_POINT = re.compile(
     r"f|m|v|a|q|w|u|n|velocity|speed|vel|acc\w*|acceleration|omega|force|moment|torque|rot\w*|angle|kraft|geschwindigkeit|"
     r"beschleunigung|e|ma|inde|fle|std|sd|err\w*|sigma|area|"
