@@ -20,6 +20,8 @@ _GROUPED = {
     ",": re.compile(rf"[+-]?[1-9]\d{{0,2}}((\.\d{{3}})+|([{_MARKS}]\d{{3}})+)(,\d+)?"),
 }
 """Numbers with marks between thousands. None begins with 0, so that 0.125 is no 125."""
+_UNIT = re.compile(r"(?<=\d)\s?(?![eE][+-]?\d)[a-zA-Z%‰µμ°][^\s,;.]{0,11}$")
+"""A unit after a number in a cell: `5 %`, `12,3 mm`."""
 CLOCK = re.compile(
     r"(?:(?P<date>\d{4}-\d\d-\d\d|\d{4}/\d\d/\d\d|\d{1,2}\.\d{1,2}\.\d{4}|\d{1,2}/\d{1,2}/\d{4}),?[T ] ?)?(?P<first>\d{1,2}):"
     r"(?P<second>\d\d(?:[.,]\d{1,9}(?!:))?)(?::(?P<third>\d\d(?:[.,]\d{1,9})?))?(?:(?P<mark>[:;])(?P<frames>\d\d))?"
@@ -153,6 +155,8 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _in_dialect(cell: str, decimal: str) -> bool:
+    """Whether a cell is a number in this dialect, alone or before its unit."""
+    cell = _UNIT.sub("", cell)
     number = _COMMA.fullmatch(cell) if decimal == "," else NUMBER.fullmatch(cell)
     return number is not None or _GROUPED[decimal].fullmatch(cell) is not None
 
@@ -161,6 +165,6 @@ def _with_point(cell: str, decimal: str) -> str:
     """Rewrite a number with a decimal point and without thousands separators; return other text unchanged."""
     if not _in_dialect(cell, decimal):
         return cell
-    if _GROUPED[decimal].fullmatch(cell):
+    if _GROUPED[decimal].fullmatch(_UNIT.sub("", cell)):
         cell = re.sub(rf"[{_MARKS}{',' if decimal == '.' else '.'}]", "", cell)
     return cell.replace(",", ".")

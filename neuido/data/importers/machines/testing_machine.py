@@ -96,6 +96,13 @@ class MachineTable:
         titles = ", ".join(filter(None, self.table.titles))
         return UserError(f"{self.name} has no {what}: name its column with --columns.{quantity} TITLE (titles: {titles[:300]})")
 
+    def refuse_component(self, name: str, what: str, quantities: tuple[str, str]) -> None:
+        """Refuse a component such as `E11` or `S11`, whose name is used for two quantities, and name the options for both."""
+        title = next((title for title in self.table.titles if bare_title(title) == name), None)
+        if title is not None:
+            options = " or ".join(f"--columns.{quantity} {title!r}" for quantity in quantities)
+            raise UserError(f"{self.name}: column {title!r} may be {what}: give {options}")
+
     def strain(self, quantity: str) -> np.ndarray:
         """Return a strain as a ratio; one of more than `LARGEST_RATIO` needs a unit."""
         values = self._measured(self.found[quantity])
@@ -167,11 +174,14 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
     }
     pairs = [("log_strain", "true_stress"), ("stretch", "nominal_stress"), ("strain", "nominal_stress")]
     path = next((p for p, s in pairs if p in found and s in found and p in ("stretch", "strain")), None)
-    path = path or next((key for key in ("log_strain", "stretch", "strain", "displacement") if key in found), None)
+    path = path or next((key for key in ("log_strain", "stretch", "green_strain", "strain", "displacement") if key in found), None)
     if path is None:
+        given.refuse_component("e11", "a Green or an engineering strain", ("green_strain", "strain"))
         raise given.missing("stretch, strain or displacement", "strain")
     if path == "stretch":
         out["stretch"] = given.column("stretch", "", required=False)
+    elif path == "green_strain":
+        out["stretch"] = _stretch_of_green(given)
     elif path == "displacement":
         length = given.size("length", "has a displacement of a specimen")
         moved = given.column("displacement", "m")
@@ -183,14 +193,19 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
         given.summary.append(f"specimen of length {1e3 * length:g} mm -> stretch")
     else:
         out["log_strain" if path == "log_strain" else "stretch"] = given.strain(path) + (0.0 if path == "log_strain" else 1.0)
-    stress = next((key for key in ("nominal_stress", "true_stress", "force") if key in found), None)
+    stress = next((key for key in ("nominal_stress", "true_stress", "second_piola_stress", "force") if key in found), None)
     if path == "log_strain" and "true_stress" in found:
         stress = "true_stress"
     if stress is None:
+        given.refuse_component("s11", "a second Piola-Kirchhoff or a true stress", ("second_piola_stress", "true_stress"))
         raise given.missing("stress or force", "force")
     if stress == "force":
         area = given.area()
         out["nominal_stress"] = given.column("force", "N") / area
+    elif stress == "second_piola_stress":
+        stretch = np.exp(out["log_strain"]) if path == "log_strain" else out["stretch"]
+        out["nominal_stress"] = given.column(stress, "Pa") * stretch
+        given.summary.append("nominal stress = stretch times second Piola-Kirchhoff stress")
     else:
         out[stress] = given.column(stress, "Pa")
     sources = (given.title(path), given.title(stress))
@@ -203,6 +218,18 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
             out[key] = 2.0 - out[key] if key == "stretch" else -out[key]
         given.summary.append("compression is counted as positive, signs turned")
     return out
+
+
+def _stretch_of_green(given: MachineTable) -> np.ndarray:
+    """Return the stretch of a Green strain E, sqrt(1 + 2 E)."""
+    strain = given.strain("green_strain")
+    if (strain <= -0.5).any():
+        raise UserError(
+            f"{given.name}: {given.title('green_strain')!r} reaches {np.nanmin(strain):.3g}, and a Green strain is above -0.5: is it an "
+            "engineering strain (--columns.strain), or is compression positive?"
+        )
+    given.summary.append("stretch = sqrt(1 + 2 E) of the Green strain E")
+    return np.sqrt(1 + 2 * strain)
 
 
 def _make_compression(out: dict[str, np.ndarray], given: MachineTable, *, stated: bool) -> None:

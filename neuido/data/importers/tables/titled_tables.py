@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.importers.tables.cell_units import with_units_above
 from neuido.data.importers.tables.clocks import clock_seconds, is_clock, over_midnight
 from neuido.data.importers.tables.spreadsheets import is_spreadsheet, read_spreadsheet
 from neuido.data.importers.tables.titles import SPECIMEN, UNIT_IN_TITLE, bare_title, find_columns
@@ -28,6 +29,8 @@ _STATISTIC = re.compile(
     re.IGNORECASE,
 )
 """A word that heads a row of a summary below a table."""
+_MICRO = re.compile(r"\b(micro[- _]?strain|mikrodehnung|[µμ]strain|[µμ]ε)", re.IGNORECASE)
+"""A title of strains that is their unit too."""
 _PAGE = re.compile(r"(page|seite|blatt|p.gina)\b.{0,30}", re.IGNORECASE)
 """A line between the pages of one table."""
 
@@ -60,11 +63,12 @@ def read_cells(path: Path) -> tuple[list[list[str]], list[str]]:
 def _sheets(path: Path) -> tuple[dict[str, list[list[str]]], list[str]]:
     """Read the rows of each sheet by name; a text file is one sheet without a name."""
     if is_spreadsheet(path):
-        return read_spreadsheet(path), []
+        sheets = read_spreadsheet(path)
+        return {name: with_units_above(rows, LEAST_ROWS, path.name) for name, rows in sheets.items()}, []
     table = read_delimited(path)
     names = {"\t": "tabs", " ": "blanks", ",": "commas", ";": "semicolons"}
     notes = [f"{names[table.separator]} between columns", f"encoding {table.encoding}"]
-    return {"": table.rows}, [*notes, "decimal commas"] if table.decimal == "," else notes
+    return {"": with_units_above(table.rows, LEAST_ROWS, path.name)}, [*notes, "decimal commas"] if table.decimal == "," else notes
 
 
 def read_titled(path: Path) -> Table:
@@ -214,6 +218,8 @@ def _block(rows: list[list[str]], first: int, stop: int, notes: list[str]) -> Ta
         found = UNIT_IN_TITLE.search(title)
         if found and not units[i] and is_unit(found[1] or found[2] or ""):
             units[i] = (found[1] or found[2] or "").strip()
+        elif not units[i] and _MICRO.search(title):
+            units[i] = "microstrain"
     cells = _without_summary(rows, first, notes)
     data = np.full((len(cells), width), np.nan)
     for i, row in enumerate(cells):

@@ -28,14 +28,16 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "frequency": r"(angular )?frequency|ang\.? frequency|omega|ω|(kreis)?frequenz",
     "viscosity": r".*viscosity.*|viskosit.t|eta",
     "true_stress": r"true stress.*|cauchy.*|wahre spannung|contrainte vraie|(esfuerzo|tensi.n) (verdader|real).*",
-    "log_strain": r"true strain.*|log\w* strain|hencky.*|wahre dehnung|"
+    "log_strain": r"le[ _]?(11|xx)|true strain.*|log\w* strain|hencky.*|wahre dehnung|"
     r"d.formation (vraie|logarithmique)|deformaci.n (verdader|real|logar).*",
-    "stretch_1": _axis("stretch|lambda", "λ|l", "1", "x"),
-    "stretch_2": _axis("stretch|lambda", "λ|l", "2", "y"),
+    "green_strain": r".*green.*(strain|lagrange|dehnung).*",
+    "second_piola_stress": r"(.* )?(2nd|second|2\.) ?(piola|pk).*|(s_?)?pk ?(2|ii)( stress)?",
+    "stretch_1": _axis("stretch|lambda", "λ|l", "1", "x") + "|f[ _]?(11|xx)",
+    "stretch_2": _axis("stretch|lambda", "λ|l", "2", "y") + "|f[ _]?(22|yy)",
     "strain_1": _axis("strain|eps|epsilon", "e|ε", "1", "x"),
     "strain_2": _axis("strain|eps|epsilon", "e|ε", "2", "y"),
-    "nominal_stress_1": _axis(r"\w* ?stress|sigma", "s|p", "1", "x"),
-    "nominal_stress_2": _axis(r"\w* ?stress|sigma", "s|p", "2", "y"),
+    "nominal_stress_1": _axis(r"\w* ?stress|sigma", "s|p", "1", "x") + "|p[ _]?(11|xx)",
+    "nominal_stress_2": _axis(r"\w* ?stress|sigma", "s|p", "2", "y") + "|p[ _]?(22|yy)",
     "force_1": _axis("force|load|kraft", "f", "1", "x"),
     "force_2": _axis("force|load|kraft", "f", "2", "y"),
     "displacement_1": _axis("extension|displacement|elongation", "u", "1", "x"),
@@ -44,7 +46,7 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "shear": r"shear strain|amount of shear|shear|scherung|gleitung|gamma|γ|cisaillement|distorsi.n",
     "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ|.*contrainte.*|.*esfuerzo.*|tensión.*",
     "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ|.longation relative",
-    "strain": r".*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
+    "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
     "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
     "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|"
     r"verl.ngerung|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
@@ -72,9 +74,10 @@ _NO_POINT = re.compile(
     r"(.*[ _])?(rotation|velocity|speed|force)"
 )
 """What stands before an axis and is no point, or before the last letter of another word."""
-_SIBLINGS = {"strain": "displacement", "displacement": "strain", "nominal_stress": "force", "force": "nominal_stress"}
+_SIBLINGS = {"strain": "displacement", "displacement": "strain", "nominal_stress": "force", "force": "nominal_stress", "stretch": "force"}
 """Quantities that share words, as an elongation in mm or in percent, and are told apart by the unit."""
-_EXPECTED = {"strain": "", "displacement": "m", "nominal_stress": "Pa", "force": "N"}
+_EXPECTED = {"strain": "", "displacement": "m", "nominal_stress": "Pa", "force": "N", "stretch": ""}
+_LOADS = {"nominal_stress", "nominal_stress_1", "true_stress", "second_piola_stress", "force", "force_1", "shear_stress"}
 SPECIMEN = re.compile(r"(specimen|sample|probe|test|versuch)[ _]?(id|no\.?|nr\.?|number|name|label|index|nummer)?")
 """Title of a column that says which specimen a row belongs to."""
 
@@ -118,7 +121,20 @@ def find_columns(titles: Sequence[str], given: dict[str, str] | None = None, uni
         if unit and base in _SIBLINGS and not measures(unit, _EXPECTED[base]) and measures(unit, _EXPECTED[_SIBLINGS[base]]):
             quantity = _SIBLINGS[base] + quantity[len(base) :]
         found.setdefault(quantity, i)
-    return found
+    return found | _by_company(titles, units, found)
+
+
+def _by_company(titles: Sequence[str], units: Sequence[str] | None, found: dict[str, int]) -> dict[str, int]:
+    """Return the stress whose letter tells it only beside another column: `P` at a stretch, `S11` at a logarithmic strain `LE11`."""
+    if found.keys() & _LOADS:
+        return {}
+    bare = {bare_title(title): i for i, title in enumerate(titles) if i not in found.values()}
+    if "p" in bare and found.keys() & {"stretch", "stretch_1"}:
+        force = units is not None and units[bare["p"]] and measures(units[bare["p"]], "N")
+        return {"force" if force else "nominal_stress": bare["p"]}
+    if "s11" in bare and "log_strain" in found:
+        return {"true_stress": bare["s11"]}
+    return {}
 
 
 def named_points(titles: Sequence[str]) -> dict[str, dict[str, int]]:

@@ -48,6 +48,11 @@ def measures(unit: str, to: str) -> bool:
     return _ratio(_spelled(unit), to) is not None
 
 
+def ratio(unit: str, other: str) -> float | None:
+    """Return how many of `other` a unit is; None where they are of different kinds."""
+    return _ratio(_spelled(unit), _spelled(other))
+
+
 @lru_cache(512)
 def _ratio(own: str, to: str) -> float | None:
     """Return the ratio of two units; None where the first is no unit, or one of another kind."""
