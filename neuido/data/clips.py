@@ -5,7 +5,6 @@ flow (V, T - 1, S, S, 2) float16 [m/s], cell (V,) [m], frame_interval [s], and n
 and stress (n, 3, 3) [Pa], float32.
 """
 
-import zipfile
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, TensorDataset
 
 from neuido.data.bodies.families import check_entry
-from neuido.data.files.parsing import read_arrays, read_json
+from neuido.data.files.parsing import is_zip, read_arrays, read_json
 from neuido.data.files.values import list_of_mappings
 from neuido.errors import UserError
 
@@ -50,7 +49,7 @@ class FlowBatch(NamedTuple):
 
 def is_complete(path: Path) -> bool:
     """Whether the file of a clip exists and is complete."""
-    return path.is_file() and zipfile.is_zipfile(path)
+    return is_zip(path)
 
 
 def read_clip(path: Path) -> Clip:
@@ -60,16 +59,16 @@ def read_clip(path: Path) -> Clip:
         UserError: The file is missing, truncated or not a clip.
     """
     arrays = read_arrays(path, Clip._fields, what="clip of `neuido film`")
+    for name, array in arrays.items():
+        if array.dtype.kind != "f" or array.dtype.itemsize > 8 or not np.isfinite(array).all():
+            raise UserError(f"{path} is not a valid clip of `neuido film`: {name} must hold finite floating-point numbers")
     flow, cell = arrays["flow"], arrays["cell"]
     if arrays["frame_interval"].size != 1 or not arrays["frame_interval"].reshape(()) > 0:
         raise UserError(f"{path} is not a valid clip of `neuido film`: frame_interval must be one number")
     if flow.ndim != 5 or flow.shape[2] != flow.shape[3] or flow.shape[4] != 2 or cell.shape != flow.shape[:1] or min(flow.shape) < 1:
         raise UserError(f"{path} is not a valid clip of `neuido film`: flow and cell have the shapes {flow.shape} and {cell.shape}")
-    if any(arrays[name].shape != (len(arrays["trial"]), 3, 3) for name in ("trial", "corrected", "stress")):
+    if any(arrays[name].shape != (*arrays["trial"].shape[:1], 3, 3) for name in ("trial", "corrected", "stress")):
         raise UserError(f"{path} is not a valid clip of `neuido film`: trial, corrected and stress must be (n, 3, 3)")
-    for name, array in arrays.items():
-        if array.dtype.kind != "f" or array.dtype.itemsize > 8 or not np.isfinite(array).all():
-            raise UserError(f"{path} is not a valid clip of `neuido film`: {name} must hold finite floating-point numbers")
     parts = {name: torch.from_numpy(arrays[name]) for name in Clip._fields if name != "frame_interval"}
     return Clip(**parts, frame_interval=float(arrays["frame_interval"].reshape(())))
 

@@ -2,7 +2,6 @@
 
 import re
 import sys
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from neuido.commands.cli.mistakes import given_options
 from neuido.commands.cli.trainer_help import LINKED, given_content
 from neuido.commands.cli.wrong_values import value_place
+from neuido.data.files.parsing import is_zip
 from neuido.errors import UserError
 
 
@@ -69,5 +69,5 @@ def check_checkpoint(given: str | None) -> None:
         return
     if not Path(given).exists():
         raise UserError(f"ckpt_path = {given}: there is no such file")
-    if not Path(given).is_dir() and not (Path(given).is_file() and zipfile.is_zipfile(given)):
+    if not Path(given).is_dir() and not is_zip(given):
         raise UserError(f"ckpt_path = {given} is not a checkpoint, or is cut short")

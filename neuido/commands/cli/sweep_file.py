@@ -7,15 +7,18 @@ import os
 import random
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from neuido.data.files.yaml_files import checking
 from neuido.errors import UserError
+from neuido.physics.runtime.limits import check_limit, limit
 
 KEYS = ("program", "command", "method", "metric", "parameters", "name", "description", "project", "entity", "run_cap", "early_terminate")
 SPECIFICATION = ("value", "values", "distribution", "min", "max", "q", "mu", "sigma", "probabilities")
+RUNS = "NEUIDO_MAX_YAML_NODES"
+"""The limit of the runs that a file stands for, as of the values that it expands to."""
 COMMAND = ("${env}", "${interpreter}", "${program}", "${args}")
 """Of a file that gives none, as wandb has it."""
 MACRO, VARIABLE = re.compile(r"\$\{(\w+)\}"), re.compile(r"\$\{envvar:([A-Z0-9_]*)\}")
@@ -210,11 +213,14 @@ def runs_of(sweep: SweepFile, *, count: int | None = None, seed: int = 0) -> lis
     count = sweep.run_cap if count is None else count
     paths = list(sweep.leaves)
     if sweep.method == "grid":
-        grid = itertools.product(*(_choices(sweep.leaves[path]) for path in paths))
-        values = list(itertools.islice(grid, count))
+        most = min(limit(RUNS) + 1, count or limit(RUNS) + 1)  # the first runs of a grid take no more of the values of one parameter
+        choices = [_choices(sweep.leaves[path], most) for path in paths]
+        check_limit(min(math.prod(map(len, choices)), most), RUNS, "the grid of the sweep has too many runs")
+        values = list(itertools.islice(itertools.product(*choices), count))
     elif count is None:
         raise UserError("a random sweep has no end: give --count, or run_cap in the file")
     else:
+        check_limit(count, RUNS, f"the sweep has {count} runs")
         values = [_drawn(sweep, random.Random(f"{seed} {i}")) for i in range(count)]
     runs: list[Run] = []
     for i, row in enumerate(values):
@@ -225,12 +231,12 @@ def runs_of(sweep: SweepFile, *, count: int | None = None, seed: int = 0) -> lis
     return runs
 
 
-def _choices(specification: Mapping[str, Any]) -> list[Any]:
+def _choices(specification: Mapping[str, Any], most: int) -> Sequence[Any]:
     if specification["distribution"] == "constant":
         return [specification["value"]]
     if specification["distribution"] == "categorical":
         return specification["values"]
-    return list(range(specification["min"], specification["max"] + 1))
+    return range(specification["min"], min(specification["max"] + 1, specification["min"] + most))
 
 
 def _drawn(sweep: SweepFile, rng: random.Random) -> list[Any]:

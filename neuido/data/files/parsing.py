@@ -210,6 +210,14 @@ def read_arrays(
         return {name: _read_array(archive, members[name], path, what) for name in (*needed, *optional) if name in members}
 
 
+def is_zip(path: str | os.PathLike) -> bool:
+    """Return whether a path is a zip file, such as an .npz or a checkpoint, whose table of contents is there."""
+    try:
+        return Path(path).is_file() and zipfile.is_zipfile(path)
+    except (zipfile.BadZipFile, OSError):  # a table of contents that lies
+        return False
+
+
 def _read_array(archive: zipfile.ZipFile, member: str, path: Path, what: str) -> np.ndarray:
     with archive.open(member) as stream:
         version = np.lib.format.read_magic(stream)

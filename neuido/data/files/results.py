@@ -1,6 +1,7 @@
 """Read the results of runs for tables and figures: scores, scores by time step, logged curves and videos."""
 
 import math
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,13 +39,16 @@ class Entry(NamedTuple):
 
     def by_frame(self, scene: str) -> list[dict[str, Any]]:
         """Read particles.csv of a scene, one row per time step; empty if there is none."""
-        path = (self.folder(scene) or Path()) / self.stage / "particles.csv"
-        return read_rows(path) if self.scores is not None and path.is_file() else []
+        folder = self.folder(scene)
+        if folder is None:
+            return []
+        path = (folder_of(folder, self.stage) if self.stage else folder) / "particles.csv"  # a stage stands in a file, and may be no path
+        return read_rows(path) if os.path.isfile(path) else []  # unlike Path.is_file, this takes a name that is too long
 
     def videos(self, scene: str) -> list[Path]:
         """List the videos of a scene; only the last stage of a run has videos."""
         folder = self.folder(scene)
-        return sorted(folder.glob("*.mp4")) if folder and folder.is_dir() and self.last else []
+        return sorted(folder.glob("*.mp4")) if folder and os.path.isdir(folder) and self.last else []
 
 
 def open_runs(given: Sequence[str]) -> list[Entry]:

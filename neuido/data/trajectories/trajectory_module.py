@@ -140,11 +140,11 @@ class TrajectoryDataModule(LightningDataModule):
 
     @property
     def stress_rms(self) -> Tensor:
-        return torch.tensor([entry["stress_rms"] for entry in self._entries("train")])
+        return torch.tensor([float(entry["stress_rms"]) for entry in self._entries("train")])
 
     @property
     def residual_rms(self) -> Tensor:
-        return torch.tensor([entry["residual_rms"] for entry in self._entries("train")])
+        return torch.tensor([float(entry["residual_rms"]) for entry in self._entries("train")])
 
     @property
     def instance_names(self) -> list[str]:
@@ -160,11 +160,11 @@ class TrajectoryDataModule(LightningDataModule):
 
     @property
     def instance_stress_rms(self) -> Tensor:
-        return torch.tensor([entry["stress_rms"] for entry in self._entries("held_out")])
+        return torch.tensor([float(entry["stress_rms"]) for entry in self._entries("held_out")])
 
     @property
     def instance_residual_rms(self) -> Tensor:
-        return torch.tensor([entry["residual_rms"] for entry in self._entries("held_out")])
+        return torch.tensor([float(entry["residual_rms"]) for entry in self._entries("held_out")])
 
     def _entries(self, part: str) -> list[dict[str, Any]]:
         return [entry for entry in self.index["trajectories"] if entry["split"] == part]
