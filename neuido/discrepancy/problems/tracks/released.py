@@ -123,7 +123,7 @@ class Released:
             parts = [self.track.t[i : min(i + BLOCK, n)] for i in range(0, n, BLOCK)]
             self._factors[n] = [np.linalg.inv(np.linalg.cholesky(self.error.covariance(t))) for t in parts]
         cuts = range(0, n, BLOCK)
-        done = [np.einsum("ij,pja->pia", w, errors[:, i : i + BLOCK]) for i, w in zip(cuts, self._factors[n], strict=True)]
+        done = [np.tensordot(w, errors[:, i : i + BLOCK], (1, 1)).swapaxes(0, 1) for i, w in zip(cuts, self._factors[n], strict=True)]
         return np.concatenate(done, axis=1)
 
 
