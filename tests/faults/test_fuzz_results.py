@@ -12,7 +12,16 @@ def test_damaged_files(tmp_path, reader):
     assert tried == reader.quick and not faults, summary(faults)
 
 
-FOUND = {"nclaw": (184,), "sweep": (498,), "runs": (163,), "clips": (326,), "trajectories": (615,), "checkpoint": (477,)}
+FOUND = {
+    "nclaw": (184,),
+    "sweep": (498,),
+    "runs": (163,),
+    "clips": (326,),
+    "trajectories": (615,),
+    "checkpoint": (477,),
+    "setting": (911,),
+    "diagnosis": (904,),
+}
 """Inputs that once ended in a traceback or took the memory."""
 
 

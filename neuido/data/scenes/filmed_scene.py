@@ -310,6 +310,8 @@ def _arrays(path: Path, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndar
     arrays = read_arrays(path, shapes)
     for key, shape in shapes.items():
         array = arrays[key]
+        if array.dtype.kind not in "biuf":
+            raise UserError(f"{path}: {key} holds {array.dtype} and not numbers")
         if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape)) or not np.isfinite(array).all():
             raise UserError(f"{path}: {key} has the wrong shape {array.shape}, or contains a NaN or an infinity")
     return arrays

@@ -168,7 +168,7 @@ class Diagnosis:
             return ErrorChange(before, after, own[0].unit, floor, all(row.held_out for row in own))
         e = self._content["error"]
         key = scored_by(e["after"])
-        before, after = (math.nan if e[when][key] is None else e[when][key] for when in ("before", "after"))
+        before, after = (math.nan if e[when].get(key) is None else e[when][key] for when in ("before", "after"))
         floor = math.hypot(*(e[name] or 0.0 for name in ("noise_floor", "discretisation_floor")))
         return ErrorChange(before, after, e["unit"], floor, key == "held_out")
 
