@@ -13,7 +13,7 @@ def test_damaged_files(tmp_path, reader):
 
 
 FOUND = {
-    "nclaw": (184,),
+    "nclaw": (184, 519),
     "sweep": (498,),
     "runs": (163,),
     "clips": (326,),

@@ -46,8 +46,8 @@ def read_nclaw_weights(path: str | Path) -> tuple[list[Tensor], list[Tensor]]:
     if not path.is_file():
         raise UserError(f"NCLaw's weights {path} are missing: give the path of an nclaw-*.npz file")
     arrays = read_arrays(path, None, what="file of NCLaw's weights")
-    if texts := [name for name, array in arrays.items() if array.dtype.kind != "f"]:
-        raise UserError(f"{path}: the array {texts[0]} holds {arrays[texts[0]].dtype} and not floating-point numbers")
+    if wrong := [name for name, array in arrays.items() if array.dtype.kind != "f" or array.dtype.itemsize > 8]:
+        raise UserError(f"{path}: the array {wrong[0]} holds {arrays[wrong[0]].dtype} and not floats of up to 64 bits")
     weights = {name: torch.from_numpy(array) for name, array in arrays.items()}
     return tuple([_layer(weights, f"{part}.{name}", shape, path) for name, shape in LAYERS] for part in PARTS)  # type: ignore[return-value]
 
