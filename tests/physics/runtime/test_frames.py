@@ -94,5 +94,5 @@ def test_public_names_exist():
     for package in (importlib.import_module(f"neuido.physics{room}") for room in rooms):
         assert package.__all__ and all(getattr(package, name) is not None for name in package.__all__)
         assert set(package.__all__) <= set(dir(package))
-    with pytest.raises(AttributeError, match="No neuido.physics.laws attribute Nothing"):
+    with pytest.raises(AttributeError, match=r"No neuido\.physics\.laws attribute Nothing"):
         _ = laws.Nothing
