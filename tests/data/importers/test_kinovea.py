@@ -31,7 +31,7 @@ def test_a_table_of_one_or_two_trajectories(tmp_path, separator, decimal):
     """Commas stand between cells also where they are decimal signs, and a point that is not tracked leaves its cells empty."""
     head = ["Time", "Marker 1/0/X", "Marker 1/0/Y"]
     (tmp_path / "one.csv").write_text(quoted([head, *CENTIMETRES], separator, decimal), newline="")
-    with pytest.raises(UserError, match=r"1e-06 times model\."):
+    with pytest.raises(UserError, match=r"cale: \{t: 0\.001\}"):
         neuido.import_file(tmp_path / "one.csv", tmp_path / "one", scale=0.01)
     neuido.import_file(tmp_path / "one.csv", tmp_path / "one", **GIVEN)
     same(tmp_path / "one", "one")
