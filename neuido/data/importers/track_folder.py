@@ -219,7 +219,8 @@ def _check_repeats(path: Path, t: np.ndarray, points: Mapping[str, np.ndarray], 
     """
     x = np.column_stack(list(points.values()))
     rows = np.flatnonzero(np.isfinite(t) & np.isfinite(x).any(axis=1))
-    _, first = np.unique(np.column_stack([t, np.nan_to_num(x)])[rows], axis=0, return_index=True)
+    seen = np.isfinite(x)  # beside the places, so that one which was not seen is no copy of one at zero
+    _, first = np.unique(np.column_stack([t, seen, np.where(seen, x, 0.0)])[rows], axis=0, return_index=True)
     rows = rows[np.sort(first)]  # without copies
     back = np.flatnonzero(np.diff(t[rows]) < 0) + 1
     parts = np.split(t[rows], back)

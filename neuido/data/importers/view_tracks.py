@@ -181,7 +181,7 @@ def _meeting(pixels: np.ndarray, cameras: Sequence[View]) -> tuple[np.ndarray, n
     before = error.ravel().copy()
     limit = max(FINEST, STRAY * float(np.nanmedian(error))) if np.isfinite(error).any() else FINEST
     bad = 0
-    for frame in np.flatnonzero(np.nan_to_num(error).max(axis=0) > limit):
+    for frame in np.flatnonzero((error > limit).any(axis=0)):
         while np.nanmax(error[:, frame], initial=0.0) > limit and np.isfinite(pixels[:, frame, 0]).sum() > 2:
             trials = []
             for view in np.flatnonzero(np.isfinite(pixels[:, frame, 0])):

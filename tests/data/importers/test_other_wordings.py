@@ -240,3 +240,11 @@ def test_refused(tmp_path, kind):
     with pytest.raises(UserError, match=words):
         neuido.import_file(tmp_path / "a.csv", tmp_path / "out", **({"density": 1e3, "young": 1e5} if "id" in lines[0] else {}))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_place_that_was_not_seen_is_no_copy_of_one_at_zero(tmp_path):
+    """Of rows at one time, one with y = 0 and one without y are two places: the clock is too coarse."""
+    rows = [f"{0.05 * (i // 2):.2f},{0.1 * (i // 2):.3f},{'0' if i % 2 else ''}" for i in range(40)]
+    (tmp_path / "coarse.csv").write_text("t (s),x (m),y (m)\n" + "\n".join(rows) + "\n")
+    with pytest.raises(UserError, match=r"20 of 40 rows have the time of another row and another place"):
+        neuido.import_file(tmp_path / "coarse.csv", tmp_path / "out", kind="track")
