@@ -10,6 +10,7 @@ from typing import Any
 from neuido.data.files.parsing import read_json
 from neuido.data.files.writing import write_json
 from neuido.errors import UserError, shortened
+from neuido.physics.runtime.lazy import import_extra
 
 MARK = ".task.json"
 """Written last: what the task was, by a digest, and what it returned."""
@@ -85,10 +86,7 @@ def finish(out: str, digest: str, value: Any) -> None:
 
 def _system(path: str) -> tuple[Any, str]:
     """Return the file system of an address, and the place in it."""
-    try:
-        import fsspec
-    except ImportError as error:
-        raise UserError(f"{path} is an address, for which the package fsspec is needed: pip install 'neuido[scale]'") from error
+    fsspec = import_extra("fsspec", f"the address {path}", extra="scale")
     try:
         return fsspec.core.url_to_fs(path)
     except (ImportError, ValueError) as error:

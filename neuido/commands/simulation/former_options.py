@@ -14,12 +14,10 @@ import yaml
 
 from neuido.commands.cli.config_files import given_configs, in_place, inline, is_content
 from neuido.data.trajectories.options import Throw, make_trajectories
-from neuido.data.undeclared import Case
 from neuido.errors import UserError
 from neuido.installation import configs_root
 
 THROW = tuple(field.name for field in fields(Throw))
-CASE = tuple(field.name for field in fields(Case))
 COMMON = ("out", "device", "progress")
 KNOWN = {  # command: its options, of those that `neuido simulate` had
     "trajectories": (*COMMON, "families", "instances", "held_out", "seed", "setup", *THROW, "shard", "shards", "batch"),

@@ -71,7 +71,8 @@ def declared_guide(guide: Guide, *, floor: float | None, mass: float | None) -> 
         other = "--guide plane" if wrong == "tilt" else " or ".join(f"--guide {name}" for name, own in needs.items() if wrong in own)
         raise UserError(f"--{wrong} belongs to {other}, and the track is that of {_words(guide.type)}: leave it out, or give {other}")
     if guide.type == "none":
-        return {"gravity": level}, ["the body flies freely under 9.81 m/s^2 along -y (--guide pendulum, spring, axis, plane or bounce)"]
+        said = f"the body flies freely under {GRAVITY:g} m/s^2 along -y (--guide pendulum, spring, axis, plane or bounce)"
+        return {"gravity": level}, [said]
     for key in needs[guide.type]:
         if key not in given:
             what, option = FIGURES[key]
@@ -88,7 +89,7 @@ def declared_guide(guide: Guide, *, floor: float | None, mass: float | None) -> 
     if free:
         model["free"] = free
     said = ", ".join(f"{key} {value:g}{' (fitted)' if key in free else ''}" for key, value in figures.items())
-    return model, [f"guided: {_words(guide.type)}{', ' + said if said else ''}; gravity 9.81 m/s^2"]
+    return model, [f"guided: {_words(guide.type)}{', ' + said if said else ''}; gravity {GRAVITY:g} m/s^2"]
 
 
 def guided_axes(kind: str, x: np.ndarray, names: Sequence[str]) -> tuple[list[str], str]:

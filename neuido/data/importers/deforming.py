@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from neuido.data.files.writing import write_arrays, write_text
+from neuido.data.importers.declared_guide import GRAVITY
 from neuido.data.importers.rest_body import rest_body
 from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.errors import UserError
@@ -138,7 +139,7 @@ def declared_content(
     content = {
         "format": "neuido-experiment/1",
         "name": name,
-        "scene": {"domain": [lower.tolist(), upper.tolist()], "gravity": [0.0, -9.81, 0.0], "colliders": colliders},
+        "scene": {"domain": [lower.tolist(), upper.tolist()], "gravity": [0.0, -GRAVITY, 0.0], "colliders": colliders},
         "model": {"density": float(density), "elasticity": elasticity, "plasticity": {"law": "identity"}, "free": ["young"]},
         "discretisation": {"grid": cells, "dt": dt},
         "recordings": recordings,
@@ -146,7 +147,7 @@ def declared_content(
     notes = [
         f"model: fixed corotated elasticity, Young's modulus {young:g} Pa (fitted), density {density:g} kg/m^3, Poisson's ratio "
         f"{elasticity['poisson']:g}{'' if poisson is not None else ' (assumed: --poisson)'}, no plasticity",
-        "gravity 9.81 m/s^2 along -y (--up z where z points up); "
+        f"gravity {GRAVITY:g} m/s^2 along -y (--up z where z points up); "
         + (f"floor at y = {floor:g} m" if floor is not None else "no floor (--floor HEIGHT adds one)"),
         f"grid of {cells} cells of {1e3 * longest / cells:.3g} mm, steps of {1e3 * dt:g} ms",
     ]

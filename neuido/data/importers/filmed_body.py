@@ -122,9 +122,7 @@ def write_filmed_body(
             highs.append([*found.high, depth])
             spacings.append(spacing)
         low, high, spacing = np.min(lows, axis=0), np.max(highs, axis=0), float(np.median(spacings))
-        content, notes = declared_content(
-            next(iter(files)), low, high, float(np.median(spacings)), density, young, poisson, floor, recordings
-        )
+        content, notes = declared_content(next(iter(files)), low, high, spacing, density, young, poisson, floor, recordings)
         summary.extend(notes)
         write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 

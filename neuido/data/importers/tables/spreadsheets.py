@@ -5,7 +5,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-from neuido.data.files.parsing import one_line, parser_errors
+from neuido.data.files.parsing import is_zip, one_line, parser_errors
 from neuido.errors import UserError
 from neuido.physics.runtime.lazy import import_extra
 from neuido.physics.runtime.limits import check_limit
@@ -38,7 +38,7 @@ def read_spreadsheet(path: Path) -> dict[str, list[list[str]]]:
     calamine = import_extra("python_calamine", path.name)
     check_limit(path.stat().st_size, "NEUIDO_MAX_TEXT_BYTES", f"{path} has {path.stat().st_size} bytes")
     with parser_errors(path, "spreadsheet"):
-        if zipfile.is_zipfile(path):
+        if is_zip(path):
             _check_size(path)
         book = calamine.CalamineWorkbook.from_path(str(path))
         sheets = {name: book.get_sheet_by_name(name).to_python(skip_empty_area=True) for name in book.sheet_names}

@@ -245,9 +245,7 @@ class Course:
         return comparing.is_settled(self.search.lab, self.at.errors)
 
 
-def fit_declared_model(
-    problem: Problem, new_search: Callable[[int], Search], journal: Journal
-) -> tuple[list[Search], list[Stand]]:  # fmt: skip
+def fit_declared_model(problem: Problem, new_search: Callable[[int], Search], journal: Journal) -> tuple[list[Search], list[Stand]]:
     """Fit the declared model by each method of simulation that may be needed, and return the searches and the fits.
 
     A further method is tried only where the ones before leave more than noise, and time.
