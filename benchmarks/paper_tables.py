@@ -133,8 +133,10 @@ def page() -> str:
     rows, exact = rows_of(RESULTS / "table1.csv"), rows_of(RESULTS / "paper_runs.csv")
     parts = [
         "# The paper, table by table\n\n"
-        "Neither the paper's films nor the materials in them are published: our scenes have its bodies, grid, cameras and frames, and materials\n"
-        "of ours. So its figures and ours can be compared in size and order, not to the digit. Rows that begin with `paper` are printed there;\n"
+        "Neither the paper's films nor the materials in them are published: our scenes have its bodies, grid, cameras "
+        "and frames, and materials\n"
+        "of ours. So its figures and ours can be compared in size and order, not to the digit. Rows that begin with "
+        "`paper` are printed there;\n"
         "`the paper's settings` are `configs/paper`, with our flow encoder in the place of Tora's; all others are our variant and our own\n"
         "versions of the peers. Figures of our variant are of `pretrained-objective` unless said otherwise.\n",
         section(
@@ -145,14 +147,16 @@ def page() -> str:
         ),
         section(
             "Figure 3: visual fidelity on new views",
-            "Means over the six scenes on the two views that no stage sees. The paper's figure is a chart without numbers, and LPIPS needs weights\n"
+            "Means over the six scenes on the two views that no stage sees. The paper's figure is a chart without "
+            "numbers, and LPIPS needs weights\n"
             "that were not at hand.",
             "neuido sweep configs/experiments/table1.yaml",
             visual(rows, exact),
         ),
         section(
             "Table 3: dimension of the latent",
-            "Its left half (losses of Stage I) is on [the page of the paper's Stage I](paper_stage1.md). Its right half (CD after Stage II by "
+            "Its left half (losses of Stage I) is on [the page of the paper's Stage I](paper_stage1.md). Its right "
+            "half (CD after Stage II by "
             "dimension)\nwas not run.",
             "neuido sweep configs/sweeps/latent_dim.yaml",
             "",
@@ -165,7 +169,8 @@ def page() -> str:
         ),
         section(
             "Table 4: one view of a real recording",
-            "PSNR in dB. The recordings are not at hand: ours are films of their published bodies with a material of ours, 19 frames of three\n"
+            "PSNR in dB. The recordings are not at hand: ours are films of their published bodies with a material of "
+            "ours, 19 frames of three\n"
             "cameras, so that the levels differ; what can be compared is the loss from all views to one.",
             "neuido sweep configs/experiments/monocular.yaml",
             monocular(rows_of(RESULTS / "monocular.csv")) if (RESULTS / "monocular.csv").is_file() else "",
@@ -186,7 +191,8 @@ def page() -> str:
         "`neuido predict --config configs/experiments/transfer.yaml` writes the videos. The paper gives no figures.\n\n"
         "## Figure 7: the latents\n\nt-SNE and interpolation are on [the page of the latents](latents.md): "
         "`neuido latents --config configs/experiments/latent_space.yaml`.\n\n"
-        "## Not run\n\nThe comparison with Spring-Gaus on its real recordings (Figure 4 and 12 a), which are not at hand, and curves of CD over time as a\n"
+        "## Not run\n\nThe comparison with Spring-Gaus on its real recordings (Figure 4 and 12 a), which are not at "
+        "hand, and curves of CD over time as a\n"
         "figure (Figure 10): `neuido fit` and `neuido test` write them to `frames.csv` of each scene.\n",
     ]
     return "\n".join(parts)
