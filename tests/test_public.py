@@ -42,9 +42,9 @@ PUBLIC = {
     """,
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",
     "neuido.physics.laws": """
-        AutogradElastic AutogradPlastic BoundedElastic DruckerPrager ElasticLaw FixedCorotated Identity InvariantElastic
-        InvariantPlastic NeoHookean ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic Sigma SymbolicElastic
-        SymbolicPlastic VonMises by_body material stack
+        AutogradElastic AutogradPlastic BoundedElastic DruckerPrager ElasticLaw FixedCorotated Fluid Gent Hyperfoam Identity
+        InvariantElastic InvariantPlastic MooneyRivlin NeoHookean ObjectiveElastic ObjectivePlastic PlasticLaw RawElastic RawPlastic
+        Sigma Snow SymbolicElastic SymbolicPlastic VolumetricReset VonMises by_body material stack
     """,
     "neuido.discrepancy": "DiagnosedEffects Diagnosis Effect ErrorChange OwnEffect Quantity diagnose",
 }

@@ -17,8 +17,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.effects.point_library import BODIES_TOO
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
-from neuido.physics.laws.parametric import ParametricLaw
+from neuido.physics.laws.parametric import ParametricElastic, ParametricLaw
 from neuido.types import Particles
 
 NO_FLOW, VON_MISES, DRUCKER_PRAGER = classical_kernels.IDENTITY, classical_kernels.VON_MISES, classical_kernels.DRUCKER_PRAGER
@@ -105,8 +104,8 @@ def shear_modulus(law: ElasticLaw) -> Tensor:
         Shear modulus [Pa], one value per scene of the law.
     """
     tensors = law.tensors()
-    if isinstance(law, (FixedCorotated, Sigma, NeoHookean, StackedElastic)):
-        return tensors[0][:, 0]
+    if isinstance(law, ParametricElastic):
+        return law.moduli()[0]
     rows = law.modulus().shape[0]
     like = tensors[0] if tensors else law.modulus()
     h = 1e-4 if like.dtype == torch.float64 else 1e-2
@@ -177,7 +176,7 @@ def _flow(
         raise UserError("cohesion needs a declared drucker_prager plasticity, whose cone it moves; declare it or leave cohesion out")
     if of_yield and any(kind != NO_FLOW for kind in base):
         raise UserError("yield_inverse needs an elastic body, and the declared plasticity yields already; leave one of them out")
-    if given and any(kind == DRUCKER_PRAGER for kind in base):
+    if given and any(kind not in (NO_FLOW, VON_MISES) for kind in base):
         raise UserError(f"{given[0]} needs a declared von_mises plasticity, or an elastic body")
     flowing = [name for name in given if name != "softening"]
     if flowing and not of_yield and all(kind == NO_FLOW for kind in base):
@@ -185,6 +184,8 @@ def _flow(
     declared = any(kind != NO_FLOW for kind in base)
     if not (of_yield or effects.cohesion is not None or (declared and (given or (scaled and VON_MISES in base)))):
         return None, ()
+    if any(kind > DRUCKER_PRAGER for kind in base):
+        raise UserError("bodies whose yield stress an effect changes cannot share a rollout with snow or a fluid: run them by themselves")
     column = {name: effects.rows(name, count, like)[:, 0] for name in ("yield_inverse", *own, "cohesion")}
     kinds = tuple(VON_MISES if of_yield and kind == NO_FLOW else kind for kind in base)
     radius = like.new_zeros(count)

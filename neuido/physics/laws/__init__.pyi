@@ -1,10 +1,12 @@
 from .base import AutogradElastic, AutogradPlastic, ElasticLaw, PlasticLaw
 from .classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, Sigma, VonMises, material, stack
 from .composite import by_body
+from .hyperelastic import Fluid, Gent, Hyperfoam, MooneyRivlin
 from .neural.bounded import BoundedElastic
 from .neural.invariants import InvariantElastic, InvariantPlastic
 from .neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 from .neural.symbolic import SymbolicElastic, SymbolicPlastic
+from .resets import Snow, VolumetricReset
 
 __all__ = [
     "AutogradElastic",
@@ -13,9 +15,13 @@ __all__ = [
     "DruckerPrager",
     "ElasticLaw",
     "FixedCorotated",
+    "Fluid",
+    "Gent",
+    "Hyperfoam",
     "Identity",
     "InvariantElastic",
     "InvariantPlastic",
+    "MooneyRivlin",
     "NeoHookean",
     "ObjectiveElastic",
     "ObjectivePlastic",
@@ -23,8 +29,10 @@ __all__ = [
     "RawElastic",
     "RawPlastic",
     "Sigma",
+    "Snow",
     "SymbolicElastic",
     "SymbolicPlastic",
+    "VolumetricReset",
     "VonMises",
     "by_body",
     "material",

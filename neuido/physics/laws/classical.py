@@ -13,7 +13,9 @@ from torch import Tensor
 from neuido.errors import UserError, suggest
 from neuido.physics.laws import classical_kernels
 from neuido.physics.laws.base import AutogradElastic, AutogradLaw, AutogradPlastic, ElasticLaw, Law, Parameter, PlasticLaw
-from neuido.physics.laws.parametric import ParametricLaw, checked_parameters, lame
+from neuido.physics.laws.hyperelastic import Fluid, Gent, Hyperfoam, MooneyRivlin
+from neuido.physics.laws.parametric import ParametricElastic, ParametricLaw, ParametricPlastic, checked_parameters, lame
+from neuido.physics.laws.resets import Snow, VolumetricReset
 from neuido.physics.linalg import decompositions as linalg
 from neuido.physics.linalg.warp_functions import FLOOR
 
@@ -24,13 +26,19 @@ __all__ = [
     "DruckerPrager",
     "ElasticLaw",
     "FixedCorotated",
+    "Fluid",
+    "Gent",
+    "Hyperfoam",
     "Identity",
     "Law",
+    "MooneyRivlin",
     "NeoHookean",
     "PlasticLaw",
     "Sigma",
+    "Snow",
     "StackedElastic",
     "StackedPlastic",
+    "VolumetricReset",
     "VonMises",
     "lame",
     "material",
@@ -38,8 +46,8 @@ __all__ = [
 ]
 
 
-class _ClassicalElastic(ParametricLaw, ElasticLaw):
-    _plastic = False
+class _OfYoung(ParametricElastic):
+    columns = 2
 
     def __init__(self, young: Parameter, poisson: Parameter):
         """
@@ -56,12 +64,16 @@ class _ClassicalElastic(ParametricLaw, ElasticLaw):
         """Return Lamé's parameters mu and lambda [Pa], one tensor (S, 2)."""
         return (torch.stack(lame(self.young, self.poisson), -1),)
 
+    def moduli(self) -> tuple[Tensor, Tensor]:
+        mu, lam = self.tensors()[0].unbind(1)
+        return mu, lam + 2 / 3 * mu
+
     def modulus(self) -> Tensor:
         parameters = self.tensors()[0]
         return 2 * parameters[:, 0] + parameters[:, 1]
 
 
-class FixedCorotated(_ClassicalElastic):
+class FixedCorotated(_OfYoung):
     """Fixed corotated elasticity: tau = 2 mu (F - R) F^T + lambda J (J - 1) I.
 
     R is the rotation of the polar decomposition F = R S, and J = det F. Source: paper, appendix "Classical Material Models".
@@ -80,7 +92,7 @@ class FixedCorotated(_ClassicalElastic):
         return linalg.isotropic_stress(F, at, t, slopes)
 
 
-class Sigma(_ClassicalElastic):
+class Sigma(_OfYoung):
     """Hencky elasticity: tau = U diag(2 mu log sigma + lambda tr(log sigma)) U^T with F = U diag(sigma) V^T.
 
     The stress is linear in the logarithmic strain. Inside the logarithm, principal stretches are bounded below by
@@ -98,7 +110,7 @@ class Sigma(_ClassicalElastic):
         return linalg.isotropic_stress(F, at, t, 2 * mu.unsqueeze(-1) * linalg.log_difference(at.sigma, FLOOR))
 
 
-class NeoHookean(_ClassicalElastic):
+class NeoHookean(_OfYoung):
     """Neo-Hookean elasticity: tau = mu (F F^T - I) + lambda ln(J) I with J = det F.
 
     Inside the logarithm, J is bounded below by `warp_functions.FLOOR`. Source: PAC-NeRF (Li et al. 2023).
@@ -114,11 +126,7 @@ class NeoHookean(_ClassicalElastic):
         return mu * (F @ F.mT - eye) + lam * J.log() * eye
 
 
-class _ClassicalPlastic(ParametricLaw, PlasticLaw):
-    _plastic = True
-
-
-class Identity(_ClassicalPlastic):
+class Identity(ParametricPlastic):
     """No plasticity: the corrected gradient is the trial F (paper, appendix, Identity Plasticity)."""
 
     kind = classical_kernels.IDENTITY
@@ -145,7 +153,7 @@ def _return(F: Tensor, at: linalg.Frame, radius: Tensor, strain: Tensor, elastic
     return torch.where(elastic[..., None, None], F, linalg.isotropic_map(F, at, h.exp(), slopes))
 
 
-class VonMises(_ClassicalPlastic):
+class VonMises(ParametricPlastic):
     """Von Mises plasticity: metal, clay.
 
     A deviatoric Hencky strain of norm above tau_Y / (2 mu) is scaled back to that norm. F is unchanged inside the yield surface, and
@@ -181,7 +189,7 @@ class VonMises(_ClassicalPlastic):
         return _return(F, at, parameters, strain, deviator <= parameters[..., 0].detach())
 
 
-class DruckerPrager(_ClassicalPlastic):
+class DruckerPrager(ParametricPlastic):
     """Drucker-Prager plasticity: sand without cohesion.
 
     Under compression, a strain outside the cone of friction is returned to the cone. Under expansion the elastic stretch is reset to the
@@ -229,7 +237,10 @@ class _Stacked(ParametricLaw):
         self.laws = tuple(laws)
 
     def tensors(self) -> tuple[Tensor, ...]:
-        return (torch.cat([law.tensors()[0] for law in self.laws]),)
+        """Return the parameters of all laws, one tensor (S, n); rows of laws with fewer than n parameters end in zeros."""
+        rows = [law.tensors()[0] for law in self.laws]
+        width = max(own.shape[1] for own in rows)
+        return (torch.cat([torch.nn.functional.pad(own, (0, width - own.shape[1])) for own in rows]),)
 
     def scene_laws(self) -> tuple[type[ParametricLaw], ...]:
         return sum((law.scene_laws() for law in self.laws), ())
@@ -238,28 +249,29 @@ class _Stacked(ParametricLaw):
         return f"{type(self).__name__}({', '.join(map(repr, self.laws))})"
 
 
-class StackedElastic(_Stacked, ElasticLaw):
+class StackedElastic(_Stacked, ParametricElastic):
     """Elastic laws of several scenes as one law, so that the scenes run in one kernel launch; made by `stack`.
 
     Args:
         laws: Classical elastic laws, each for one or several scenes.
     """
 
-    _plastic = False
-    laws: tuple["_ClassicalElastic | StackedElastic", ...]
+    laws: tuple[ParametricElastic, ...]
+
+    def moduli(self) -> tuple[Tensor, Tensor]:
+        shear, bulk = zip(*(law.moduli() for law in self.laws))
+        return torch.cat(shear), torch.cat(bulk)
 
     def modulus(self) -> Tensor:
         return torch.cat([law.modulus() for law in self.laws])
 
 
-class StackedPlastic(_Stacked, PlasticLaw):
+class StackedPlastic(_Stacked, ParametricPlastic):
     """Plastic laws of several scenes as one law, so that the scenes run in one kernel launch; made by `stack`.
 
     Args:
         laws: Classical plastic laws, each for one or several scenes.
     """
-
-    _plastic = True
 
     def __init__(self, laws: Sequence[ParametricLaw]):
         super().__init__(laws)
@@ -279,8 +291,8 @@ def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
         UserError: No laws, elastic and plastic laws together, or a law that is not classical.
     """
     names = [type(law).__name__ for law in laws]
-    elastic = [law for law in laws if isinstance(law, (_ClassicalElastic, StackedElastic))]
-    plastic = [law for law in laws if isinstance(law, (_ClassicalPlastic, StackedPlastic))]
+    elastic = [law for law in laws if isinstance(law, ParametricElastic)]
+    plastic = [law for law in laws if isinstance(law, ParametricPlastic)]
     if not laws or len(elastic) + len(plastic) < len(laws):
         raise UserError(f"stack() takes one or more classical laws, got {names}; run other laws in a simulator of their own")
     if not plastic:

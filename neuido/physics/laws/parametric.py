@@ -1,4 +1,4 @@
-"""Laws with a few material parameters per scene, evaluated by the Warp kernels of `classical_kernels`."""
+"""Laws with a few material parameters per scene, evaluated by the Warp kernels of `classical_kernels` or `extended_kernels`."""
 
 import math
 import numbers
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.physics.laws import classical_kernels
-from neuido.physics.laws.base import Law, Parameter
+from neuido.physics.laws import classical_kernels, extended_kernels
+from neuido.physics.laws.base import ElasticLaw, Law, Parameter, PlasticLaw
 from neuido.physics.runtime.device import launch, real_of, torch_stream
 from neuido.types import Particles, brief
 
@@ -34,7 +34,16 @@ _RANGES = {
     "poisson": (-1.0, 0.5, ""),
     "yield_stress": (0.0, math.inf, " Pa"),
     "friction_angle": (0.0, 90.0, " degrees"),
+    "c10": (0.0, math.inf, " Pa"),
+    "c01": (0.0, math.inf, " Pa"),
+    "shear": (0.0, math.inf, " Pa"),
+    "bulk": (0.0, math.inf, " Pa"),
+    "limit": (0.0, math.inf, ""),
+    "exponent": (0.0, math.inf, ""),
+    "compression": (0.0, 1.0, ""),
+    "stretch": (0.0, math.inf, ""),
 }
+_MAY_BE_ZERO = ("c01",)
 
 
 def checked_parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
@@ -61,9 +70,11 @@ def checked_parameters(law: type, **values: Parameter) -> tuple[Tensor, ...]:
                 f"{law.__name__}: {name} is a {value.dtype} tensor of shape {tuple(value.shape)}; give float32 or float64, (S,)"
             )
         value = value.reshape(-1)
-        bad = ~((value > low) & (value < high)).detach()
+        above = value >= low if name in _MAY_BE_ZERO else value > low
+        bad = ~(above & (value < high)).detach()
         if bad.any():
-            allowed = f"{name} > {low:g}" if high == math.inf else f"{low:g} < {name} < {high:g}"
+            least = ">=" if name in _MAY_BE_ZERO else ">"
+            allowed = f"{name} {least} {low:g}" if high == math.inf else f"{low:g} < {name} < {high:g}"
             finite = " and finite" if high == math.inf else ""
             raise UserError(f"{law.__name__}: {name} = {value.detach()[bad][0].item():g}{unit} is out of range: need {allowed}{finite}")
         tensors.append(value)
@@ -81,7 +92,9 @@ class ParametricLaw(Law):
     """
 
     kind: int
-    """Number of the law in `classical_kernels`."""
+    """Number of the law in `classical_kernels` or `extended_kernels`."""
+    columns = 1
+    """Number of parameters of the law that the kernels read."""
     _plastic: bool
     """Whether the law is plastic."""
 
@@ -100,17 +113,25 @@ class ParametricLaw(Law):
         raise NotImplementedError
 
     def kinds(self, device: torch.device) -> Tensor:
-        """Return the number of each scene's law in `classical_kernels`, (S,) int32."""
+        """Return the number of each scene's law in the kernels, (S,) int32."""
         cache = self.__dict__.setdefault("_kind_cache", {})
         if device not in cache:  # recorded launches refer to the tensor by its address, so two threads must share one
             cache.setdefault(device, torch.tensor([law.kind for law in self.scene_laws()], dtype=torch.int32, device=device))
         return cache[device]
 
+    @property
+    def extended(self) -> bool:
+        """Whether the law of a scene is one that only `extended_kernels` has."""
+        last = classical_kernels.DRUCKER_PRAGER if self._plastic else classical_kernels.NEO_HOOKEAN
+        if "_extended" not in self.__dict__:
+            self.__dict__["_extended"] = any(law.kind > last for law in self.scene_laws())
+        return self.__dict__["_extended"]
+
     def _launch(
         self, name: str, tensors: Sequence[Tensor], arrays: Sequence[Tensor], parameters: Tensor | None, particles: Particles
     ) -> None:
         F = arrays[0]
-        kernel = getattr(classical_kernels.kernels(real_of(F.dtype)), name)
+        kernel = getattr((extended_kernels if self.extended else classical_kernels).kernels(real_of(F.dtype)), name)
         row = tensors[0].detach().to(F).contiguous()
         inputs: list[Any] = [F, self.kinds(F.device), row, particles.scene, *arrays[1:]]
         if name.endswith("adjoint"):
@@ -150,7 +171,7 @@ class ParametricLaw(Law):
         (parameters,), laws = self.tensors(), self.scene_laws()
         parameters = parameters.to(F)
         if len(laws) == 1:
-            return laws[0].twin(F, parameters[0])
+            return laws[0].twin(F, parameters[0, : laws[0].columns])
         if particles is None:
             raise UserError(f"{type(self).__name__} has {len(laws)} scenes: give `particles`, the scene of each F")
         out = torch.zeros_like(F)
@@ -158,7 +179,7 @@ class ParametricLaw(Law):
         kinds = self.kinds(F.device)[scene]
         for law in dict.fromkeys(laws):
             (index,) = torch.nonzero(kinds == law.kind, as_tuple=True)
-            out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index]]))
+            out = out.index_copy(0, index, law.twin(F[index], parameters[scene[index], : law.columns]))
         return out
 
     def __repr__(self) -> str:
@@ -185,3 +206,23 @@ class _SingleScene(ParametricLaw):
 
     def scene_laws(self) -> tuple[type[ParametricLaw], ...]:
         return (self._law,)
+
+
+class ParametricElastic(ParametricLaw, ElasticLaw):
+    """Base class of isotropic elastic laws; a subclass defines `moduli`."""
+
+    _plastic = False
+
+    def moduli(self) -> tuple[Tensor, Tensor]:
+        """Return the shear and the bulk modulus at F = I [Pa], (S,) each."""
+        raise NotImplementedError
+
+    def modulus(self) -> Tensor:
+        shear, bulk = self.moduli()
+        return bulk + 4 / 3 * shear
+
+
+class ParametricPlastic(ParametricLaw, PlasticLaw):
+    """Base class of isotropic plastic laws."""
+
+    _plastic = True

@@ -161,7 +161,8 @@ def choose(plan: Plan, inputs: Sequence[Tensor], *, backward: bool = False) -> P
 
 
 def _are_classical(plan: Plan) -> bool:
-    return all(law is None or isinstance(law, ParametricLaw) for law in (plan.elasticity, plan.plasticity))
+    """Return whether the kernels of a whole substep have both laws; `extended_kernels` run between launches of the transfers."""
+    return all(law is None or (isinstance(law, ParametricLaw) and not law.extended) for law in (plan.elasticity, plan.plasticity))
 
 
 def _are_networks(plan: Plan) -> bool:

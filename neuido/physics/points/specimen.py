@@ -6,7 +6,7 @@ import torch
 
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma, StackedElastic
+from neuido.physics.laws.parametric import ParametricElastic
 from neuido.physics.points.point_law import PointLaw
 from neuido.types import Particles, brief_fields
 
@@ -37,4 +37,4 @@ class Specimen(NamedTuple):
 
 def is_classical(law: ElasticLaw) -> bool:
     """Return whether an elastic law is one of the isotropic classical ones."""
-    return isinstance(law, (FixedCorotated, Sigma, NeoHookean, StackedElastic))
+    return isinstance(law, ParametricElastic)
