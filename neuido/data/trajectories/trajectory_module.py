@@ -47,8 +47,9 @@ class TrajectoryDataModule(LightningDataModule):
     Attributes:
         trajectory_count, names, families, parameters: Of the training instances, in the order of the trajectory index.
         stress_rms, residual_rms: Root mean square of the Frobenius norm of the stress [Pa] and of F_hat - F_tr [-], (M,) float32.
-        instance_names, instance_families, instance_parameters, instance_stress_rms, instance_residual_rms: The same of the held-out
-            instances.
+        viscosity: Their `reference_viscosity` [Pa s], (M,) float32; zero where the files do not say.
+        instance_names, instance_families, instance_parameters, instance_stress_rms, instance_residual_rms, instance_viscosity: The same
+            of the held-out instances.
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class TrajectoryDataModule(LightningDataModule):
             require_key(entry, "split", where)
             for key in ("stress_rms", "residual_rms"):
                 number(require_key(entry, key, where), f"{where}.{key}", least=0.0)
+            number(entry.get("viscosity", 0.0), f"{where}.viscosity", least=0.0)
             if not is_complete(self.root / f"{entry['name']}.npy", self._shape(content)):
                 raise UserError(f"{self.root / entry['name']}.npy is missing or truncated: generate it again with `{command}`")
         return content
@@ -147,6 +149,10 @@ class TrajectoryDataModule(LightningDataModule):
         return torch.tensor([float(entry["residual_rms"]) for entry in self._entries("train")])
 
     @property
+    def viscosity(self) -> Tensor:
+        return torch.tensor([float(entry.get("viscosity", 0.0)) for entry in self._entries("train")])
+
+    @property
     def instance_names(self) -> list[str]:
         return [entry["name"] for entry in self._entries("held_out")]
 
@@ -165,6 +171,10 @@ class TrajectoryDataModule(LightningDataModule):
     @property
     def instance_residual_rms(self) -> Tensor:
         return torch.tensor([float(entry["residual_rms"]) for entry in self._entries("held_out")])
+
+    @property
+    def instance_viscosity(self) -> Tensor:
+        return torch.tensor([float(entry.get("viscosity", 0.0)) for entry in self._entries("held_out")])
 
     def _entries(self, part: str) -> list[dict[str, Any]]:
         return [entry for entry in self.index["trajectories"] if entry["split"] == part]

@@ -13,10 +13,11 @@ import numpy as np
 from neuido.data.files.writing import write_text
 from neuido.errors import UserError
 from neuido.export.materials.learned import learned_laws
-from neuido.physics.laws.neural.bounded import BoundedElastic
+from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.bounded_kernels import EXPONENT, RANGE, SHORTEST, SPREAD, T1, VOLUME_FLOOR
 from neuido.physics.laws.neural.network_kernels import COARSE, DELTA, FINE, LINEAR, LODE
 from neuido.physics.laws.neural.networks import RAW_GAIN, RawElastic, RawPlastic
+from neuido.physics.laws.neural.return_kernels import CRUSH, ROOT, SKEW
 
 PER_LINE = 6
 """Numbers in a line of an array."""
@@ -139,17 +140,17 @@ static inline void NAME_stressS(const REAL F[9], REAL tau[9]) {
 }
 """
 
-OBJECTIVE_PLASTIC = """
+RETURN_MAP = """
 /* corrected deformation gradient of a trial one */
 static inline void NAME_correctedS(const REAL F[9], REAL out[9]) {
-    REAL l, q, A[9], x[9], c[3], Y[9], E[9], t[9];
+    REAL l, q, A[9], x[9], c[COUNT], D[9], Y[9], E[9], t[9];
     NAME_hencky_strainS(F, &l, A, &q);
     NAME_strain_featuresS(l, A, q, x);
     NAME_plastic_networkS(x, c);
     const REAL radius = C(PLASTIC_SCALE) * c[0] + c[1] * fmaxS(-l, 0);
     const REAL f = fminS(fmaxS(1 - radius / q, 0), 1);
-    const REAL u = l > 0 ? fminS(fmaxS(l - C(PLASTIC_SCALE) * c[2], 0), l) : 0;
-    for (int i = 0; i < 9; ++i) Y[i] = C(-0.25) * f * A[i];
+    DIRECTION
+    for (int i = 0; i < 9; ++i) Y[i] = C(-0.25) * f * D[i];
     for (int i = 0; i < 9; ++i) E[i] = (i % 4 == 0) + Y[i] / 4;
     for (int k = 3; k > 0; --k) { /* exp(4 Y): a Taylor polynomial of degree four, squared twice */
         NAME_mulS(Y, E, t);
@@ -162,6 +163,23 @@ static inline void NAME_correctedS(const REAL F[9], REAL out[9]) {
     for (int i = 0; i < 9; ++i) out[i] *= shrink;
 }
 """
+
+TENSION = "fminS(fmaxS(l - C(PLASTIC_SCALE) * c[2], 0), l)"
+
+OBJECTIVE_PLASTIC = RETURN_MAP.replace("COUNT", "3").replace(
+    "DIRECTION",
+    f"""const REAL u = l > 0 ? {TENSION} : 0;
+    for (int i = 0; i < 9; ++i) D[i] = A[i];""",
+)
+
+FULL_PLASTIC = RETURN_MAP.replace("COUNT", "4").replace(
+    "DIRECTION",
+    f"""const REAL u = l > 0 ? {TENSION} : fminS(fmaxS(l + C(CRUSH) * C(PLASTIC_SCALE) * c[2], l), 0);
+    const REAL lean = C(ROOT) * C(SKEW) * c[3] / sqrtS(1 + c[3] * c[3]) / q;
+    NAME_mulS(A, A, t);
+    const REAL mean = (t[0] + t[4] + t[8]) / C(3.0);
+    for (int i = 0; i < 9; ++i) D[i] = A[i] + lean * (t[i] - mean * (i % 4 == 0));""",
+)
 
 BOUNDED_ELASTIC = """
 /* Kirchhoff stress [Pa] of a deformation gradient */
@@ -224,9 +242,13 @@ static inline void NAME_tangent(const double F[9], double out[81]) {
     }
 }
 """
+VISCOSITY = """/* shear viscosity [Pa s]: beside the stress of these functions, the Cauchy stress 2 NAME_viscosity D */
+static const double NAME_viscosity = {:.9g};
+"""
 CONSTANTS = {
     "DELTA": DELTA, "FINE": FINE, "COARSE": COARSE, "LODE": LODE, "LINEAR": LINEAR, "RAW_GAIN": RAW_GAIN, "RANGE": RANGE,
     "EXPONENT": EXPONENT, "SHORTEST": SHORTEST, "SPREAD": SPREAD, "T1": T1, "VOLUME_FLOOR": VOLUME_FLOOR,
+    "CRUSH": CRUSH, "ROOT": ROOT, "SKEW": SKEW,
 }  # fmt: skip
 
 
@@ -234,7 +256,7 @@ def write_c(source: Any, path: str | os.PathLike, *, name: str = "neuido", tange
     """Write a learned law as a C header.
 
     It has `NAME_stress(F, tau)` and `NAME_corrected(F, out)` for double, and `NAME_stressf` and `NAME_correctedf` for float. A substep
-    corrects the trial F first, and takes the stress of the corrected one.
+    corrects the trial F first, and takes the stress of the corrected one. The viscosity of a law that has one is `NAME_viscosity`.
 
     Args:
         source: As for `learned_laws`.
@@ -259,7 +281,7 @@ def c_text(elastic: Any, plastic: Any, *, name: str = "neuido", tangent: bool = 
     raw = isinstance(elastic, RawElastic)
     hidden = elastic.tensors()[0].shape[-2]
     stress = RAW_ELASTIC if raw else BOUNDED_ELASTIC if isinstance(elastic, BoundedElastic) else OBJECTIVE_ELASTIC
-    corrected = RAW_PLASTIC if isinstance(plastic, RawPlastic) else OBJECTIVE_PLASTIC
+    corrected = RAW_PLASTIC if isinstance(plastic, RawPlastic) else FULL_PLASTIC if isinstance(plastic, FullPlastic) else OBJECTIVE_PLASTIC
     networks = [
         NETWORK.replace("KIND", kind).replace("HIDDEN", str(law.tensors()[0].shape[-2])).replace("OUTPUTS", str(law.outputs))
         for kind, law in (("elastic", elastic), ("plastic", plastic))
@@ -271,6 +293,7 @@ def c_text(elastic: Any, plastic: Any, *, name: str = "neuido", tangent: bool = 
         "   F: deformation gradient [-], nine numbers row by row. Stress: Kirchhoff [Pa]. A substep takes the stress of the corrected F.",
         "   Functions that end in f are for float. Nothing is allocated; all functions may run in several threads. */",
         f"#ifndef {name.upper()}_LAW_H\n#define {name.upper()}_LAW_H\n#include <math.h>\n",
+        *([] if elastic.viscosity is None else [VISCOSITY.format(float(elastic.viscosity[0]))]),
         *(_arrays(kind, law) for kind, law in (("elastic", elastic), ("plastic", plastic))),
         _of_type(both, "double", "", {**CONSTANTS, **scales}),
         _of_type(both, "float", "f", {**CONSTANTS, **scales}),

@@ -35,7 +35,7 @@ def learned_laws(source: Any) -> tuple[Any, Any]:
         laws = tuple(source)
     if len(laws) != 2 or not isinstance(laws[0], ELASTIC) or not isinstance(laws[1], PLASTIC):
         names = ", ".join(type(law).__name__ for law in laws)
-        raise UserError(f"laws = {names}: give an elastic and a plastic law of `neuido predict` (raw, objective or bounded)")
+        raise UserError(f"laws = {names}: give an elastic and a plastic law of `neuido predict` (raw, objective, bounded or general)")
     for law in laws:
         if any(len(tensor) > 1 for tensor in law.tensors()):
             raise UserError(f"{type(law).__name__} is of {max(map(len, law.tensors()))} materials: give the law of one (`single_scene`)")
@@ -62,7 +62,8 @@ def _read(path: Path) -> tuple[Any, Any]:
 class LawModule(nn.Module):
     """A learned law as a module: trial F (N, 3, 3) -> corrected F (N, 3, 3) [-] and its Kirchhoff stress (N, 3, 3) [Pa].
 
-    The corrected F is the plastic law of the trial, and the stress is the elastic law of the corrected F, as in a substep.
+    The corrected F is the plastic law of the trial, and the stress is the elastic law of the corrected F, as in a substep. The buffer
+    `viscosity` [Pa s], (1,), is that of the Cauchy stress 2 viscosity D beside it.
 
     Args:
         elastic: Elastic law of one material.
@@ -72,6 +73,8 @@ class LawModule(nn.Module):
     def __init__(self, elastic: Any, plastic: Any) -> None:
         super().__init__()
         self.laws = (elastic, plastic)
+        viscosity = torch.zeros(1) if elastic.viscosity is None else elastic.viscosity.detach().clone()
+        self.register_buffer("viscosity", viscosity)
         for kind, law in (("elastic", elastic), ("plastic", plastic)):
             for name, tensor in zip(("W1", "b1", "W2", "b2", "W3", "b3"), law.tensors()):
                 self.register_buffer(f"{kind}_{name}", tensor[0].detach().double().clone())

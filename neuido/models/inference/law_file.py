@@ -1,6 +1,7 @@
 """Law files: the effective networks of one material as safetensors, with its description beside it as JSON."""
 
 import json
+import math
 import os
 from collections.abc import Mapping
 from datetime import date
@@ -37,10 +38,13 @@ def save_law(path: str | os.PathLike, operator: IntrinsicDynamicsOperator, z: Te
         tensors = {f"elastic.{name}": t for name, t in zip(WEIGHTS, elastic.tensors())}
         tensors |= {f"plastic.{name}": t for name, t in zip(WEIGHTS, plastic.tensors())}
         lambdas = operator.coefficients(z[None])
+        if elastic.viscosity is not None:
+            tensors["viscosity"] = elastic.viscosity
         tensors |= {"z": z, "lambda_elastic": lambdas[0][0], "lambda_plastic": lambdas[1][0]}
         modulus = float(elastic.modulus()[0])
     config = {"trunk": operator.trunk, "elastic_scale": elastic.scale, "plastic_scale": plastic.scale}
-    card = {"date": date.today().isoformat(), "modulus": modulus, **(card or {})}
+    known = {} if elastic.viscosity is None else {"viscosity": float(elastic.viscosity[0])}
+    card = {"date": date.today().isoformat(), "modulus": modulus, **known, **(card or {})}
     write_weights(path, FORMAT, config, {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}, card)
     text = json.dumps({"format": FORMAT, **config, "unit": "Kirchhoff stress in Pa", **card}, indent=1)
     write_text(Path(path).with_suffix(".json"), text + "\n")
@@ -66,8 +70,17 @@ def load_law(path: str | os.PathLike) -> tuple[ElasticLaw, PlasticLaw]:
             if not all(t.is_floating_point() and bool(torch.isfinite(t).all()) for t in part):
                 raise UserError(f"the tensors of {kind} must be finite numbers")
         laws = elastic(*parts[0], scale=scales[0]), plastic(*parts[1], scale=scales[1])
+        if "viscosity" in tensors:
+            laws[0].viscosity = _viscosity(tensors["viscosity"])
         if card.get("strain_limit") is not None:
             limit = number(card["strain_limit"], "strain_limit", above=0.0)
             for law in laws:
                 law.strain_limit = limit
     return laws
+
+
+def _viscosity(given: Tensor) -> Tensor:
+    """Check the shear viscosity [Pa s] of a law file, (1,)."""
+    if given.shape != (1,) or not given.is_floating_point() or not 0 <= float(given[0]) < math.inf:
+        raise UserError(f"viscosity must be one number of zero or more, got {given.tolist()}")
+    return given

@@ -22,7 +22,7 @@ from neuido.data.files.writing import atomic_write
 from neuido.data.weight_files import build, parse_metadata, read_safetensors
 from neuido.errors import UserError
 from neuido.physics.laws.neural import readouts
-from neuido.physics.laws.neural.bounded import BoundedElastic
+from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, RawElastic, RawPlastic
 
 FORMAT = "neuido-operator/1"
@@ -41,6 +41,7 @@ LAWS = {
     "raw": (RawElastic, RawPlastic),
     "objective": (ObjectiveElastic, ObjectivePlastic),
     "bounded": (BoundedElastic, ObjectivePlastic),
+    "general": (BoundedElastic, FullPlastic),
 }
 
 
@@ -75,6 +76,16 @@ class Trunk(nn.Module):
         return (coefficients @ weight).view(-1, self.outputs, self.out.in_features), coefficients @ bias.view(self.basis_dim, -1)
 
 
+VISCOSITY_UNIT = 1e-3
+"""Viscosity at an output of zero of the viscosity head [Pa s]: that of water."""
+
+NEGLIGIBLE = 1e-3
+"""Viscosity up to which a rollout without gradients leaves it out [Pa s]: that of water, not felt by a body of a centimetre or more."""
+
+VISCOSITY_RANGE = (-20.0, 15.0)
+"""Limits of the natural logarithm of the viscosity over its unit: 2e-12 to 3e3 Pa s."""
+
+
 class Head(nn.Sequential):
     """Two-layer MLP from a latent z (S, d) to the coefficients lambda (S, D)."""
 
@@ -97,11 +108,13 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     Args:
         trunk: `raw` (as in the paper: from F to nine components), `objective` (from invariants to the coefficients of an isotropic,
-            frame-indifferent law) or `bounded` (the same with a stress that cannot have the wrong sign).
+            frame-indifferent law), `bounded` (the same with a stress that cannot have the wrong sign) or `general` (`bounded` with a
+            plastic correction of any isotropic form, for fluids and snow).
         latent_dim: Latent dimension d (paper: 128).
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say; 64 suits a fused kernel).
         head_dim: Width of the heads.
+        viscous: Give the laws a shear viscosity, from a third head.
 
     Attributes:
         latents: Latents of the training trajectories, (M, d); empty until `set_latents` or `load`.
@@ -114,21 +127,23 @@ class IntrinsicDynamicsOperator(nn.Module):
 
     def __init__(
         self,
-        trunk: Literal["raw", "objective", "bounded"] = "objective",
+        trunk: Literal["raw", "objective", "bounded", "general"] = "objective",
         latent_dim: int = 128,
         basis_dim: int = 64,
         hidden_dim: int = 64,
         head_dim: int = 128,
+        viscous: bool = False,
     ):
         super().__init__()
         if trunk not in LAWS:
-            raise UserError(f"trunk = {trunk!r}: choose raw, objective or bounded")
+            raise UserError(f"trunk = {trunk!r}: choose raw, objective, bounded or general")
         self.config = {
             "trunk": trunk,
             "latent_dim": latent_dim,
             "basis_dim": basis_dim,
             "hidden_dim": hidden_dim,
             "head_dim": head_dim,
+            **({"viscous": True} if viscous else {}),
         }
         for name, value in self.config.items():
             if name != "trunk" and value < 1:
@@ -139,6 +154,7 @@ class IntrinsicDynamicsOperator(nn.Module):
         self.plastic_trunk = Trunk(basis_dim, hidden_dim, self._plastic_law.outputs)
         self.elastic_head = Head(latent_dim, head_dim, basis_dim)
         self.plastic_head = Head(latent_dim, head_dim, basis_dim)
+        self.viscosity_head = Head(latent_dim, head_dim, 1) if viscous else None
         self.set_latents(torch.zeros(0, latent_dim), [], [])
         self.card: dict[str, Any] = {}
 
@@ -195,16 +211,32 @@ class IntrinsicDynamicsOperator(nn.Module):
         y = self._outputs(self.plastic_trunk, self.plastic_head(z), self.features(F, law))
         if self.trunk == "raw" or F.requires_grad:
             return law.corrected_of(F, y, law.unit)
-        return readouts.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), law.unit).view(F.shape)
+        return readouts.CorrectionReadout.apply(y.flatten(0, 1), F.reshape(-1, 3, 3), law).view(F.shape)
 
     def _outputs(self, trunk: Trunk, coefficients: Tensor, features: Tensor) -> Tensor:
         weight, bias = trunk.contract(coefficients)
         return torch.baddbmm(bias.unsqueeze(1), trunk.hidden(features), weight.mT)
 
+    def viscosity(self, z: Tensor) -> Tensor:
+        """Return the shear viscosity [Pa s], (S,), of z (S, d) or (d,); zero without a viscosity head."""
+        z = z.reshape(-1, self.latent_dim)
+        if self.viscosity_head is None:
+            return z.new_zeros(len(z))
+        return VISCOSITY_UNIT * self.viscosity_head(z)[:, 0].clamp(*VISCOSITY_RANGE).exp()
+
     def laws(self, z: Tensor) -> tuple[ElasticNetwork, PlasticNetwork]:
-        """Return the elastic and plastic law of z (S, d) or (d,) for a rollout of S scenes, differentiable in z and all weights."""
-        elastic, plastic = self.coefficients(z.reshape(-1, self.latent_dim))
-        return self._elastic_law(*_effective(self.elastic_trunk, elastic)), self._plastic_law(*_effective(self.plastic_trunk, plastic))
+        """Return the elastic and plastic law of z (S, d) or (d,) for a rollout of S scenes, differentiable in z and all weights.
+
+        The elastic law has the viscosity of z, which every rollout adds to the effects; none if it is negligible and needs no gradient.
+        """
+        z = z.reshape(-1, self.latent_dim)
+        elastic, plastic = self.coefficients(z)
+        law = self._elastic_law(*_effective(self.elastic_trunk, elastic))
+        if self.viscosity_head is not None:
+            viscosity = self.viscosity(z)
+            if viscosity.requires_grad or bool((viscosity > NEGLIGIBLE).any()):
+                law.viscosity = viscosity
+        return law, self._plastic_law(*_effective(self.plastic_trunk, plastic))
 
     def fingerprint(self) -> str:
         """Return the first twelve hexadecimal digits of the SHA-256 of the weights: what is trained on them fits no others."""

@@ -1,5 +1,6 @@
 """Scores of the operator on constitutive data (Stage I): responses and their errors, latents of unseen materials, metrics."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,30 @@ RESIDUAL_FLOOR = 1e-5
 """Minimum epsilon of a relative plastic error [-], for elastic trajectories, whose residual is zero."""
 
 
+VISCOSITY_FLOOR = 1e-2
+"""Viscosity that counts as none beside the inertia of the bodies of Stage I [Pa s]: ten times that of water."""
+
+
+def viscosity_errors(predicted: Tensor, target: Tensor) -> Tensor:
+    """Return |ln((p + floor) / (t + floor))| of viscosities [Pa s], (M,), with `VISCOSITY_FLOOR`: about the relative error above it."""
+    return ((predicted + VISCOSITY_FLOOR).log() - (target + VISCOSITY_FLOOR).log()).abs()
+
+
+def silhouette(points: Tensor, families: Sequence[str]) -> float:
+    """Return the mean silhouette of points (M, d) with respect to their families (Rousseeuw 1987); NaN for fewer than two families."""
+    names = list(dict.fromkeys(families))
+    if len(names) < 2:
+        return math.nan
+    member = torch.tensor([[family == name for name in names] for family in families], dtype=torch.float64)
+    points = points.detach().double().cpu()
+    counts = member.sum(0)
+    sums = torch.cdist(points, points) @ member
+    own = (sums * member).sum(1) / (counts[member.argmax(1)] - 1).clamp(min=1)
+    other = torch.where(member > 0, math.inf, sums / counts).amin(1)
+    each = (other - own) / torch.maximum(own, other)
+    return float(torch.where(counts[member.argmax(1)] > 1, each, 0.0).mean())
+
+
 class OperatorResponse(NamedTuple):
     """Response of an operator to a batch of M trajectories with n samples each."""
 
@@ -28,6 +53,8 @@ class OperatorResponse(NamedTuple):
     """Relative error of the stress, (M, n)."""
     plastic_error: Tensor
     """Relative error of the plastic residual F_hat - F_tr (or of F_hat), (M, n)."""
+    stress_epsilon: Tensor
+    """Floor of the stress norm of each trajectory [Pa], (M,)."""
     residual_epsilon: Tensor
     """Floor of the residual norm of each trajectory [-], (M,)."""
 
@@ -58,7 +85,7 @@ def evaluate_operator(
         plastic_error = relative_errors(returned - trial, corrected - trial, residual_epsilon[:, None])
     else:
         plastic_error = relative_errors(returned, corrected)
-    return OperatorResponse(predicted, returned, stress_error, plastic_error, residual_epsilon)
+    return OperatorResponse(predicted, returned, stress_error, plastic_error, stress_epsilon, residual_epsilon)
 
 
 def fit_latents(
@@ -72,6 +99,8 @@ def fit_latents(
     lr: float = 0.1,
     samples: int = 128,
     plastic_target: str = "residual",
+    viscosity: Tensor | None = None,
+    viscosity_weight: float = 0.1,
     progress: bool = False,
 ) -> Tensor:
     """Fit the latents of unseen materials with the weights of the operator frozen.
@@ -88,6 +117,8 @@ def fit_latents(
         lr: Initial learning rate.
         samples: Samples of each material in a step; successive steps cycle through all of them.
         plastic_target: As for `evaluate_operator`. The loss that trained the operator gives the best fit.
+        viscosity: Viscosity of each material [Pa s], (M,), which is then fitted too; samples of stress do not show it.
+        viscosity_weight: Weight of its error (`viscosity_errors`).
         progress: Show progress on stderr.
 
     Returns:
@@ -95,15 +126,16 @@ def fit_latents(
     """
     count = len(stress_epsilon)
     trial, corrected, stress = (t.view(count, -1, 3, 3) for t in batch[:3])
-    total = trial.shape[1]
+    held = trial.shape[1]
     generator = torch.Generator().manual_seed(0)
-    order = torch.randperm(total, generator=generator).to(trial.device)
+    order = torch.randperm(held, generator=generator).to(trial.device)
 
     def errors(z: Tensor, step: int) -> Tensor:
-        rows = order[(torch.arange(min(samples, total), device=order.device) + step * samples) % total]
+        rows = order[(torch.arange(min(samples, held), device=order.device) + step * samples) % held]
         part = TrajectoryBatch(*(t[:, rows].contiguous() for t in (trial, corrected, stress)), batch.trajectory)
         answers = evaluate_operator(operator, z, part, stress_epsilon, residual_epsilon, plastic_target)
-        return (answers.stress_error + answers.plastic_error).mean(1)
+        total = (answers.stress_error + answers.plastic_error).mean(1)
+        return total if viscosity is None else total + viscosity_weight * viscosity_errors(operator.viscosity(z), viscosity)
 
     trainable = [p for p in operator.parameters() if p.requires_grad]
     for parameter in trainable:
@@ -135,8 +167,9 @@ class ConstitutiveMetrics(nn.Module):
 
     `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over the samples that yield, and
     `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. The scores of trivial predictors are included for
-    comparison: `stress_mse_zero` predicts zero stress; `plastic_mse_identity` and `plastic_error_yielding_identity` predict no plastic
-    correction. Memory is constant in the number of samples.
+    comparison: `stress_mse_zero` and `stress_error_zero/<family>` predict zero stress; `plastic_mse_identity`,
+    `plastic_error_yielding_identity` and `plastic_error_identity/<family>` predict no plastic correction. Memory is constant in the number
+    of samples.
 
     Args:
         prefix: Prefix of the metric names, e.g. `val/`.
@@ -158,6 +191,8 @@ class ConstitutiveMetrics(nn.Module):
         by_family = MetricCollection({name: MedianRelativeError() for name in self.names}, compute_groups=False)
         self.stress_by_family = by_family.clone(prefix=f"{prefix}stress_error/")
         self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
+        self.zero_by_family = by_family.clone(prefix=f"{prefix}stress_error_zero/")
+        self.unchanged_by_family = by_family.clone(prefix=f"{prefix}plastic_error_identity/")
 
     def update(self, answers: OperatorResponse, batch: TrajectoryBatch) -> None:
         """Add a batch with samples of every trajectory."""
@@ -169,11 +204,16 @@ class ConstitutiveMetrics(nn.Module):
         residual = (corrected - trial).flatten(-2).norm(dim=-1)
         flows = residual > RESIDUAL_FLOOR
         self.yielding.update(errors=answers.plastic_error[flows])
-        self.unchanged.update(errors=(residual / (residual + answers.residual_epsilon[:, None]))[flows])
+        unchanged = residual / (residual + answers.residual_epsilon[:, None])
+        self.unchanged.update(errors=unchanged[flows])
+        size = stress.flatten(-2).norm(dim=-1)
+        zero = size / (size + answers.stress_epsilon[:, None])
         for name in self.names:
             rows = [i for i, family in enumerate(self.families) if family == name]
             self.stress_by_family[name].update(answers.stress_error[rows])
             self.plastic_by_family[name].update(answers.plastic_error[rows])
+            self.zero_by_family[name].update(zero[rows])
+            self.unchanged_by_family[name].update(unchanged[rows])
 
     def compute(self) -> dict[str, Tensor]:
         return {k: v for m in self._all() for k, v in m.compute().items()}
@@ -183,4 +223,24 @@ class ConstitutiveMetrics(nn.Module):
             collection.reset()
 
     def _all(self) -> tuple[MetricCollection, ...]:
-        return self.stress, self.plastic, self.zero, self.yielding, self.unchanged, self.stress_by_family, self.plastic_by_family
+        whole = self.stress, self.plastic, self.zero, self.yielding, self.unchanged
+        return *whole, self.stress_by_family, self.plastic_by_family, self.zero_by_family, self.unchanged_by_family
+
+
+def viscosity_scores(prefix: str, predicted: Tensor, target: Tensor, families: Sequence[str]) -> dict[str, Tensor]:
+    """Return the median `viscosity_errors` over all materials and over each family, and those of the best constant.
+
+    Args:
+        prefix: Prefix of the names, e.g. `val/`.
+        predicted: Predicted viscosities [Pa s], (M,).
+        target: True viscosities [Pa s], (M,).
+        families: Family of each material.
+    """
+    constant = target.median().expand_as(target)
+    scores = {}
+    for suffix, errors in (("", viscosity_errors(predicted, target)), ("_constant", viscosity_errors(constant, target))):
+        scores[f"{prefix}viscosity_error{suffix}"] = errors.median()
+        for name in sorted(set(families)):
+            own = errors[[i for i, family in enumerate(families) if family == name]]
+            scores[f"{prefix}viscosity_error{suffix}/{name}"] = own.median()
+    return scores

@@ -9,7 +9,16 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.operator_scores import RESIDUAL_FLOOR, ConstitutiveMetrics, OperatorResponse, evaluate_operator, fit_latents
+from neuido.models.stages.operator_scores import (
+    RESIDUAL_FLOOR,
+    ConstitutiveMetrics,
+    OperatorResponse,
+    evaluate_operator,
+    fit_latents,
+    silhouette,
+    viscosity_errors,
+    viscosity_scores,
+)
 from neuido.models.stages.training import optimiser_steps, validation_scores
 from neuido.types import TrajectoryBatch
 
@@ -17,16 +26,18 @@ from neuido.types import TrajectoryBatch
 class PretrainModule(LightningModule):
     """Train the operator on constitutive data (Stage I).
 
-    The data module yields balanced batches. It provides `names`, `families`, `stress_rms` and `residual_rms` of the trajectories, and the
-    same of the held-out instances with the prefix `instance_` (`neuido.data.trajectories.trajectory_module`).
+    The data module yields balanced batches. It provides `names`, `families`, `stress_rms`, `residual_rms` and `viscosity` of the
+    trajectories, and the same of the held-out instances with the prefix `instance_` (`neuido.data.trajectories.trajectory_module`).
 
     Args:
         trajectory_count: Number of training trajectories, M (linked to the data by the command line).
-        trunk: `objective`, `bounded` or `raw` (as of `IntrinsicDynamicsOperator`).
+        trunk: `objective`, `bounded`, `general` or `raw` (as of `IntrinsicDynamicsOperator`).
         latent_dim: d (paper: 128).
         basis_dim: Number of basis functions D (the paper does not say).
         hidden_dim: Width of the trunks (the paper does not say).
         head_dim: Width of the heads (the paper does not say).
+        viscous: Learn the viscosity of each material with a third head (the paper has none).
+        viscosity_weight: Weight of the error of its logarithm in the loss.
         latent_std: Initial standard deviation of the latents (paper: 1). Components that do not affect the laws keep their initial noise;
             with 0.1 the families are separate in the latent space itself (`neuido latents`).
         lr: Learning rate of trunks and heads, for AdamW with a cosine schedule to zero over the run (paper).
@@ -48,11 +59,13 @@ class PretrainModule(LightningModule):
     def __init__(
         self,
         trajectory_count: int,
-        trunk: Literal["raw", "objective", "bounded"] = "objective",
+        trunk: Literal["raw", "objective", "bounded", "general"] = "objective",
         latent_dim: int = 128,
         basis_dim: int = 64,
         hidden_dim: int = 64,
         head_dim: int = 128,
+        viscous: bool = False,
+        viscosity_weight: float = 0.1,
         latent_std: float = 1.0,
         lr: float = 3e-3,
         latent_lr_factor: float = 10.0,
@@ -74,6 +87,7 @@ class PretrainModule(LightningModule):
             ("latent_std", latent_std),
             ("lr", lr),
             ("relative_epsilon", relative_epsilon),
+            ("viscosity_weight", viscosity_weight),
         ):
             if value <= 0:
                 raise UserError(f"model.{name} = {value}: it must be positive")
@@ -85,7 +99,7 @@ class PretrainModule(LightningModule):
             raise UserError(f"model.plastic_target = {plastic_target!r}: choose residual or full")
         self.save_hyperparameters()
         sizes = {"trunk": trunk, "latent_dim": latent_dim, "basis_dim": basis_dim, "hidden_dim": hidden_dim, "head_dim": head_dim}
-        self.operator = IntrinsicDynamicsOperator(**sizes)  # type: ignore[arg-type]
+        self.operator = IntrinsicDynamicsOperator(**sizes, viscous=viscous)  # type: ignore[arg-type]
         self.latents = nn.Parameter(latent_std * torch.randn(trajectory_count, latent_dim))
         if init_from is not None:
             self._start_from(init_from)
@@ -94,6 +108,7 @@ class PretrainModule(LightningModule):
                 each.hidden = torch.compile(each.hidden)  # type: ignore[method-assign]
         self.register_buffer("stress_epsilon", torch.ones(trajectory_count))
         self.register_buffer("residual_epsilon", torch.full((trajectory_count,), RESIDUAL_FLOOR))
+        self.register_buffer("viscosity", torch.zeros(trajectory_count), persistent=False)
         self.register_buffer("family_mean", torch.eye(trajectory_count), persistent=False)
         self.families: list[str] = []
 
@@ -114,6 +129,7 @@ class PretrainModule(LightningModule):
             raise UserError(f"model.trajectory_count = {count}, but the data have {data.trajectory_count} trajectories")
         self.stress_epsilon.copy_(self.hparams.relative_epsilon * data.stress_rms)
         self.residual_epsilon.copy_(self._residual_epsilon(data.residual_rms))
+        self.viscosity.copy_(data.viscosity)
         alike = torch.tensor([[a == b for b in data.families] for a in data.families], dtype=torch.float32, device=self.device)
         self.family_mean = alike / alike.sum(1, keepdim=True)
         self.metrics = ConstitutiveMetrics("test/" if stage == "test" else "val/", data.families)
@@ -144,7 +160,12 @@ class PretrainModule(LightningModule):
         if self.global_step % self.trainer.log_every_n_steps == 0:
             values = {"train/stress_loss": stress.detach(), "train/plastic_loss": plastic.detach()}
             self.log_dict(values, prog_bar=True)
-        return stress + plastic
+        if not self.hparams.viscous:
+            return stress + plastic
+        viscosity = viscosity_errors(self.operator.viscosity(self.latents), self.viscosity).mean()
+        if self.global_step % self.trainer.log_every_n_steps == 0:
+            self.log("train/viscosity_loss", viscosity.detach())
+        return stress + plastic + self.hparams.viscosity_weight * viscosity
 
     def _evaluate(self, batch: TrajectoryBatch, target: str = "residual") -> OperatorResponse:
         """Evaluate a batch of training trajectories; scores always compare residuals, whatever the loss compares."""
@@ -176,15 +197,22 @@ class PretrainModule(LightningModule):
         self.metrics.update(self._evaluate(batch), batch)
 
     def on_validation_epoch_end(self) -> None:
+        self._log_scores("val/")
+
+    def _log_scores(self, prefix: str) -> None:
+        """Log the scores of the validation samples, the viscosities, and the silhouette of the latents."""
+        data = self.trainer.datamodule
         self.log_dict(self.metrics.compute())
         self.metrics.reset()
+        self.log(f"{prefix}silhouette", silhouette(self.latents, data.families))
+        if self.hparams.viscous:
+            self.log_dict(viscosity_scores(prefix, self.operator.viscosity(self.latents), self.viscosity, data.families))
 
     def test_step(self, batch: TrajectoryBatch, batch_idx: int) -> None:
         self.metrics.update(self._evaluate(batch), batch)
 
     def on_test_epoch_end(self) -> None:
-        self.log_dict(self.metrics.compute())
-        self.metrics.reset()
+        self._log_scores("test/")
         self.log_dict(self.score_instances())
 
     def score_instances(self) -> dict[str, Tensor]:
@@ -198,6 +226,7 @@ class PretrainModule(LightningModule):
                 (self.hparams.relative_epsilon * data.instance_stress_rms).to(self.device),
                 self._residual_epsilon(data.instance_residual_rms).to(self.device),
             )
+            viscosity = data.instance_viscosity.to(self.device) if self.hparams.viscous else None
             z = fit_latents(
                 self.operator,
                 to_fit,
@@ -207,9 +236,14 @@ class PretrainModule(LightningModule):
                 lr=self.hparams.instance_lr,
                 samples=self.hparams.instance_samples,
                 plastic_target=self.hparams.plastic_target,
+                viscosity=viscosity,
+                viscosity_weight=self.hparams.viscosity_weight,
                 progress=self.trainer.is_global_zero,
             )
             metrics = ConstitutiveMetrics("instance/", data.instance_families).to(self.device)
             with torch.no_grad():
                 metrics.update(evaluate_operator(self.operator, z, to_score, *epsilons), to_score)
-        return metrics.compute()
+                scores = metrics.compute()
+                if viscosity is not None:
+                    scores |= viscosity_scores("instance/", self.operator.viscosity(z), viscosity, data.instance_families)
+        return scores

@@ -154,6 +154,9 @@ class EngineLaw(Law):
 class ElasticLaw(Law):
     """Map the deformation gradient F [-] to the Kirchhoff stress tau [Pa]."""
 
+    viscosity: Tensor | None = None
+    """Shear viscosity that the material brings beside its stress [Pa s], (S,); a rollout adds it to the effect `viscosity_shear`."""
+
     def modulus(self) -> Tensor:
         """Return the P-wave modulus d tau_11 / d F_11 at F = I [Pa], (S,); it bounds the stable time step."""
         raise NotImplementedError

@@ -48,7 +48,7 @@ class RolloutInputs(NamedTuple):
     mass: Tensor
     """Particle masses [kg], (P,), with the effects `added_mass` and `relative_density`."""
     viscosity: Tensor | None
-    """`Effects.viscosity` [Pa s], (S, 2)."""
+    """`Effects.viscosity` [Pa s], (S, 2), with the viscosity of the elastic law."""
     tables: Tables | None
     """Tables of the effects that act on the law; None without such effects."""
     stiffness: Tensor | None
@@ -98,7 +98,7 @@ def prepare(
         return t.to(solver.device, solver.dtype).contiguous()
 
     state = solver.state if state is None else ParticleState(*(own(t) for t in state))
-    effects = Effects() if effects is None else effects
+    effects = with_viscosity(Effects() if effects is None else effects, elasticity.viscosity)
     friction = solver.colliders.friction if friction is None else own(friction)
     if friction.shape != solver.colliders.friction.shape:
         raise UserError(f"friction has shape {tuple(friction.shape)}; it must be {tuple(solver.colliders.friction.shape)}")
@@ -126,6 +126,14 @@ def prepare(
         stiffness=stiffness,
         growth=growth,
     )
+
+
+def with_viscosity(effects: Effects, viscosity: Tensor | None) -> Effects:
+    """Return the effects with the shear viscosity of a law [Pa s], (S,), added to their own."""
+    if viscosity is None:
+        return effects
+    own = effects.viscosity_shear
+    return effects._replace(viscosity_shear=viscosity if own is None else torch.as_tensor(own).to(viscosity) + viscosity)
 
 
 def waves(

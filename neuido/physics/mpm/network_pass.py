@@ -15,17 +15,17 @@ from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
+def build(width: int, kind: str, corrects: str | None, turns: int) -> SimpleNamespace:
     """Return the kernels `advance` and `retreat`.
 
     Args:
         width: Hidden width of both networks, one of `fused.WIDTHS`.
         kind: Read-out of the elastic law, `fused.STRESS` or `fused.BOUNDED`.
-        corrects: Whether there is a plastic law.
+        corrects: Read-out of the plastic law, `fused.CORRECTION` or `fused.RETURN`; None without a plastic law.
         turns: As for `particle_functions.functions`.
     """
     start_warp()
-    name = f"neuido.substep.{width}.{kind}.{'corrected' if corrects else 'elastic'}.{turns}"
+    name = f"neuido.substep.{width}.{kind}.{corrects or 'elastic'}.{turns}"
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))  # as in `fused`
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
@@ -59,7 +59,7 @@ def build(width: int, kind: str, corrects: bool, turns: int) -> SimpleNamespace:
         return inner_adjoint(x, kept, gy, shared, scene, W1, W2T, W3T, W1T, warp, first, last, P3, PB, none, none, none)
 
     if corrects:
-        plastic = fused.correction(own, name)
+        plastic = fused.correction(own, name, corrects)
         correction_features, correction_of = plastic.features_of, plastic.value
         correction_coefficients, correction_gradient = plastic.coefficients, plastic.gradient
 

@@ -229,7 +229,8 @@ class NetworkPass(Pass):
         elastic, plastic = plan.elasticity, plan.plasticity
         self.elastic = fused.FusedEngine(elastic, inputs[FIXED : plan.split], particles)
         self.plastic = None if plastic is None else fused.FusedEngine(plastic, inputs[plan.split :], particles)
-        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, self.corrects, _turns(plan))  # type: ignore[attr-defined]
+        corrects = None if plastic is None else plastic.readout  # type: ignore[attr-defined]
+        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, corrects, _turns(plan))  # type: ignore[attr-defined]
 
     def _packed(self, engine: fused.FusedEngine | None) -> list:
         if engine is None:

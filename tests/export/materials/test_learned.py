@@ -14,12 +14,13 @@ from neuido.export.materials.learned import write_torchscript
 from neuido.models import IntrinsicDynamicsOperator, save_law
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*torch.jit.*")
-TRUNKS = ("raw", "objective", "bounded")
+TRUNKS = ("raw", "objective", "bounded", "general")
 
 
 def laws(trunk: str, dtype=torch.float32):
     torch.manual_seed(3)
-    operator = IntrinsicDynamicsOperator(trunk, latent_dim=4, basis_dim=6, hidden_dim=16, head_dim=8).to(dtype).requires_grad_(False)
+    operator = IntrinsicDynamicsOperator(trunk, latent_dim=4, basis_dim=6, hidden_dim=16, head_dim=8, viscous=trunk == "general")
+    operator = operator.to(dtype).requires_grad_(False)
     with torch.no_grad():
         for parameter in operator.parameters():
             parameter.mul_(2.0)  # outputs of order one, so that every term counts

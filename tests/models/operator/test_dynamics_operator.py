@@ -1,15 +1,21 @@
 """The operator: contraction is exact, gradients reach z and all weights, files come back as they were."""
 
+import math
+
 import pytest
 import torch
 from torch import nn
 
+from neuido.data.bodies.shapes import cube
 from neuido.errors import UserError
+from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.operator import dynamics_operator as module
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator, affine
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.neural import networks
-from neuido.physics.laws.neural.bounded import bounded_stress
-from neuido.types import Particles
+from neuido.physics.laws.neural.bounded import bounded_stress, full_return_map
+from neuido.physics.mpm.simulator import Simulator
+from neuido.types import Particles, Scene
 
 SMALL = {"latent_dim": 6, "basis_dim": 5, "hidden_dim": 16, "head_dim": 8}
 
@@ -24,7 +30,7 @@ def deformations(scenes=3, samples=7):
     return torch.eye(3, dtype=torch.float64) + 0.05 * torch.randn(scenes, samples, 3, 3, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded", "general"])
 def test_contraction_equals_the_sum_over_basis_functions(trunk):
     operator, F = make(trunk), deformations()
     z = torch.randn(3, 6, dtype=torch.float64)
@@ -34,8 +40,9 @@ def test_contraction_equals_the_sum_over_basis_functions(trunk):
     if trunk == "raw":
         tau, corrected = networks.RAW_STRESS_SCALE * c_e.view(F.shape), F + networks.STRAIN_SCALE * c_p.view(F.shape)
     else:
-        stress = bounded_stress if trunk == "bounded" else networks.isotropic_stress
-        tau, corrected = stress(F, c_e), networks.return_map(F, c_p)
+        stress = networks.isotropic_stress if trunk == "objective" else bounded_stress
+        returned = full_return_map if trunk == "general" else networks.return_map
+        tau, corrected = stress(F, c_e), returned(F, c_p)
     torch.testing.assert_close(operator.elastic(z, F), tau)
     torch.testing.assert_close(operator.plastic(z, F), corrected)
     for law, expected in zip(operator.laws(z), (tau, corrected)):
@@ -43,7 +50,7 @@ def test_contraction_equals_the_sum_over_basis_functions(trunk):
         torch.testing.assert_close(law(F.view(-1, 3, 3), particles), expected.view(-1, 3, 3))
 
 
-@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded", "general"])
 def test_gradients_of_kernels_and_twins_agree(trunk):
     """Stage I (F fixed, kernels) and the twin (F differentiable) give the same gradient of z and of every weight."""
     operator, F = make(trunk), deformations()
@@ -92,7 +99,7 @@ def test_wrapped_linear_layers_are_merged():
     torch.testing.assert_close(bias, base.bias)
 
 
-@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded"])
+@pytest.mark.parametrize("trunk", ["raw", "objective", "bounded", "general"])
 def test_file_round_trip(tmp_path, trunk):
     operator = IntrinsicDynamicsOperator(trunk, **SMALL)
     operator.set_latents(torch.randn(2, 6), ["jelly", "sand"], ["elastic", "sand"])
@@ -104,6 +111,49 @@ def test_file_round_trip(tmp_path, trunk):
     assert loaded.latent_families == ["elastic", "sand"]
     assert loaded.card["stress_error"] == 0.01 and "date" in loaded.card
     assert [p.name for p in tmp_path.iterdir()] == ["weights.safetensors"]
+
+
+def viscous():
+    torch.manual_seed(0)
+    operator = IntrinsicDynamicsOperator("general", **SMALL, viscous=True)
+    with torch.no_grad():
+        operator.viscosity_head[2].bias.fill_(math.log(3e3))  # some 3 Pa s
+    return operator
+
+
+@pytest.mark.slow
+def test_viscosity_reaches_law_file_and_rollout_and_its_gradient_the_latent(tmp_path):
+    operator = viscous()
+    z = torch.randn(6, requires_grad=True)
+    eta = operator.viscosity(z)
+    assert eta.shape == (1,) and 1 < eta.item() < 10
+    scene = Scene(cells=8, dt=1e-3, gravity=(0.0, 0.0, 0.0))
+    body = cube(length=0.4, particles_per_side=4, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0))
+    body = body._replace(v=torch.stack([body.x[:, 1], 0 * body.x[:, 0], 0 * body.x[:, 0]], 1))  # a shear flow
+    simulator = Simulator(scene, body, device="cpu")
+    laws = operator.laws(z)
+    simulator.rollout(20, *laws).v[-1].square().sum().backward()
+    assert z.grad.abs().max() > 0
+    operator.save(tmp_path / "operator.safetensors")
+    again = IntrinsicDynamicsOperator.load(tmp_path / "operator.safetensors")
+    assert torch.equal(again.viscosity(z), eta)
+    with torch.no_grad():
+        save_law(tmp_path / "law.safetensors", operator, z.detach())
+        elastic, plastic = load_law(tmp_path / "law.safetensors")
+        assert elastic.viscosity.item() == pytest.approx(eta.item()) and elastic.scaled(torch.tensor([2.0])).viscosity is elastic.viscosity
+        found = simulator.rollout(20, elastic, plastic, effects=Effects(viscosity_shear=2.0)).v[-1]
+        elastic.viscosity = None
+        torch.testing.assert_close(found, simulator.rollout(20, elastic, plastic, effects=Effects(viscosity_shear=2.0 + eta.item())).v[-1])
+        assert (found - simulator.rollout(20, elastic, plastic).v[-1]).abs().max() > 1e-4
+
+
+def test_a_viscosity_below_that_of_water_costs_no_kernel_and_older_operators_have_none():
+    operator, z = viscous().requires_grad_(False), torch.zeros(6)
+    assert operator.laws(z)[0].viscosity is not None
+    operator.viscosity_head[2].bias.fill_(-20.0)
+    assert operator.laws(z)[0].viscosity is None and 0 < operator.viscosity(z).item() < 1e-9
+    older = IntrinsicDynamicsOperator("bounded", **SMALL)
+    assert older.viscosity(z).tolist() == [0.0] and older.laws(z)[0].viscosity is None
 
 
 def test_random_latents_lie_as_the_trained_ones_do():

@@ -1,5 +1,6 @@
 """Stage I learns, scores materials that it has not seen, and goes on after SIGKILL as if nothing had happened."""
 
+import math
 import signal
 import subprocess
 import sys
@@ -14,7 +15,14 @@ from neuido.data.trajectories.options import make_trajectories
 from neuido.data.trajectories.trajectory_module import TrajectoryDataModule
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
-from neuido.models.stages.operator_scores import ConstitutiveMetrics, evaluate_operator, fit_latents
+from neuido.models.stages.operator_scores import (
+    ConstitutiveMetrics,
+    evaluate_operator,
+    fit_latents,
+    silhouette,
+    viscosity_errors,
+    viscosity_scores,
+)
 from neuido.models.stages.pretrain import PretrainModule
 from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.types import TrajectoryBatch
@@ -104,11 +112,29 @@ def test_metrics_by_hand():
     assert values["val/plastic_error_yielding"].item() == pytest.approx(torch.arange(128.0)[flows].median().item(), rel=0.05)
 
 
-@pytest.mark.parametrize("trunk", ["objective", *(pytest.param(trunk, marks=pytest.mark.slow) for trunk in ("raw", "bounded"))])
+def test_viscosities_are_scored_by_family_beside_the_best_constant():
+    true = torch.tensor([0.0, 0.0, 0.0, 1.0, 10.0])
+    found = torch.tensor([0.0, 1e-4, 0.0, 1.1, 10.0])
+    assert viscosity_errors(found, true).tolist() == pytest.approx([0.0, 0.00995, 0.0, 0.0944, 0.0], abs=1e-4)
+    scores = viscosity_scores("val/", found, true, ["sand", "sand", "sand", "fluid", "fluid"])
+    assert scores["val/viscosity_error/sand"] == 0.0 and scores["val/viscosity_error_constant"] == 0.0
+    assert scores["val/viscosity_error_constant/fluid"].item() == pytest.approx(math.log(101), rel=1e-3)
+
+
+def test_silhouette_is_that_of_scikit_learn():
+    metrics = pytest.importorskip("sklearn.metrics")
+    generator = torch.Generator().manual_seed(0)
+    families = ["a"] * 7 + ["b"] * 5 + ["c"] * 8
+    points = torch.randn(20, 6, generator=generator) + torch.tensor([0.0] * 7 + [2.0] * 5 + [-1.0] * 8)[:, None]
+    assert silhouette(points, families) == pytest.approx(metrics.silhouette_score(points.numpy(), families), rel=1e-5)
+    assert math.isnan(silhouette(points, ["a"] * 20))
+
+
+@pytest.mark.parametrize("trunk", ["objective", *(pytest.param(trunk, marks=pytest.mark.slow) for trunk in ("raw", "bounded", "general"))])
 def test_fit_writes_the_operator_and_test_scores_it(folder, tmp_path, trunk):
     seed_everything(0)
     data = TrajectoryDataModule(str(folder), batch_size=300, validation_samples=50, instance_samples=60)
-    model = PretrainModule(6, trunk, **SMALL, instance_steps=10, save_to=str(tmp_path / "operator.safetensors"))
+    model = PretrainModule(6, trunk, **SMALL, viscous=trunk == "general", instance_steps=10, save_to=str(tmp_path / "operator.safetensors"))
     fit = trainer(tmp_path, enable_checkpointing=True)
     fit.fit(model, data)
     loaded = IntrinsicDynamicsOperator.load(tmp_path / "operator.safetensors")
@@ -121,7 +147,8 @@ def test_fit_writes_the_operator_and_test_scores_it(folder, tmp_path, trunk):
     (values,) = trainer(tmp_path).test(model, TrajectoryDataModule(str(folder), batch_size=300), verbose=False)
     assert {"test/stress_mse", "test/plastic_mse", "instance/stress_error", "instance/plastic_error_yielding"} <= set(values)
 
-    started = PretrainModule(6, trunk, **SMALL, init_from=str(tmp_path / "operator.safetensors"))
+    assert -1 <= values["test/silhouette"] <= 1 and 0 < values["test/stress_error_zero/elastic"] <= 1
+    started = PretrainModule(6, trunk, **SMALL, viscous=trunk == "general", init_from=str(tmp_path / "operator.safetensors"))
     assert torch.equal(started.latents, model.latents)
 
 

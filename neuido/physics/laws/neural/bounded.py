@@ -1,6 +1,7 @@
-"""The bounded elastic law: an objective network whose stress cannot have the wrong sign (`bounded_kernels` has the formula).
+"""The bounded elastic law, whose stress cannot have the wrong sign, and the full return map, which may correct every principal strain.
 
-In the fused kernels of `fused`, and by the kernels of `bounded_kernels` elsewhere; `bounded_stress` is the same in plain torch.
+`bounded_kernels` and `return_kernels` have the formulas, and the kernels where those of `fused` do not run; `bounded_stress` and
+`full_return_map` are the same in plain torch.
 """
 
 from typing import Self
@@ -8,9 +9,18 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from neuido.physics.laws.neural import bounded_kernels, fused
+from neuido.physics.laws.neural import bounded_kernels, fused, return_kernels
 from neuido.physics.laws.neural.bounded_kernels import EXPONENT, RANGE, SHORTEST, SPREAD, T1, VOLUME_FLOOR
-from neuido.physics.laws.neural.networks import STRESS_SCALE, ObjectiveElastic, hencky_strain, strain_features
+from neuido.physics.laws.neural.networks import (
+    STRAIN_SCALE,
+    STRESS_SCALE,
+    ObjectiveElastic,
+    ObjectivePlastic,
+    hencky_strain,
+    strain_features,
+    taken_back,
+)
+from neuido.physics.laws.neural.return_kernels import CRUSH, ROOT, SKEW
 from neuido.physics.runtime.device import real_of
 
 
@@ -93,4 +103,38 @@ class BoundedElastic(ObjectiveElastic):
         *hidden, W3, b3 = self.weights
         shift = torch.zeros(len(factor), self.outputs, dtype=b3.dtype, device=b3.device)
         shift[:, :2] = factor.to(b3).log()[:, None]
-        return type(self)(*hidden, W3.expand(len(factor), -1, -1), b3 + shift, scale=self.scale)
+        return self._with(*hidden, W3.expand(len(factor), -1, -1), b3 + shift)
+
+
+def return_kernels_of(like: Tensor):
+    """Return the kernels of `return_kernels` for the scalar type of a tensor."""
+    return return_kernels.build(real_of(like.dtype))
+
+
+def full_return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
+    """Compute the corrected deformation gradient, (..., 3, 3), of a full return map from the outputs of its network.
+
+    Args:
+        F: Trial deformation gradient [-], (..., 3, 3).
+        c: Outputs of the network, (..., 4); the formula is in `return_kernels`.
+        scale: Unit of the radii [-].
+    """
+    l, A, q = hencky_strain(F)
+    f = (1 - (scale * c[..., 0] + c[..., 1] * (-l).clamp(min=0)) / q).clamp(0, 1)
+    tension = torch.minimum((l - scale * c[..., 2]).clamp(min=0), l)
+    compression = torch.where(c[..., 2] > 0, (l + CRUSH * scale * c[..., 2]).clamp(max=0), l)
+    k = ROOT * SKEW * c[..., 3] / (1 + c[..., 3].square()).sqrt()
+    D = (A @ A - A.square().sum((-2, -1))[..., None, None] / 3 * torch.eye(3, dtype=F.dtype, device=F.device)) / q[..., None, None]
+    return taken_back(F, f[..., None, None] * (A + k[..., None, None] * D), torch.where(l > 0, tension, compression))
+
+
+class FullPlastic(ObjectivePlastic):
+    """A return map of any isotropic form, from a network of the strain's invariants (`return_kernels` has the formula).
+
+    Besides what `ObjectivePlastic` does, it limits compression and may change each principal strain by itself, as snow needs.
+    """
+
+    outputs = return_kernels.COEFFICIENTS
+    readout = fused.RETURN
+    kernels = staticmethod(return_kernels_of)
+    corrected_of = staticmethod(full_return_map)

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.laws.neural import network_kernels
+from neuido.physics.laws.neural import network_kernels, readout_kernels
 from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -238,4 +238,4 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     """
     start_warp()
     name = f"neuido.bounded.{real.__name__}.{'autodiff' if enable_backward else 'adjoint'}"
-    return network_kernels.elastic_kernels(functions(real, name), real, name, enable_backward)
+    return readout_kernels.elastic_kernels(functions(real, name), real, name, enable_backward)

@@ -18,7 +18,7 @@ import warp as wp
 from torch import Tensor
 
 from neuido.physics.laws.base import Engine
-from neuido.physics.laws.neural import bounded_kernels, network_kernels
+from neuido.physics.laws.neural import bounded_kernels, network_kernels, return_kernels
 from neuido.physics.laws.neural.fused_source import BACKWARD, FORWARD
 from neuido.physics.runtime.device import launch, start_warp
 from neuido.physics.runtime.once import cached
@@ -27,8 +27,8 @@ from neuido.types import Particles
 WIDTHS = (32, 64)
 """Hidden widths for which fused kernels exist."""
 
-STRESS, CORRECTION, BOUNDED = "stress", "correction", "bounded"
-"""Read-outs of an objective law: coefficients of a stress, radii of a yield surface, moduli of a bounded stress."""
+STRESS, CORRECTION, BOUNDED, RETURN = "stress", "correction", "bounded", "return"
+"""Read-outs of an objective law: coefficients of a stress, radii of a yield surface, moduli of a bounded stress, a full return map."""
 
 BATCH, BATCH_NUMBERS = 16, 2**27
 """Most substeps whose activations are kept for one product of matrices, and numbers that they may take: half a gigabyte. A product and a
@@ -49,11 +49,13 @@ def readout(kind: str, name: str) -> SimpleNamespace:
     own = network_kernels.functions(wp.float32, name)
     if kind == STRESS:
         return SimpleNamespace(**vars(own), value=own.stress_of, coefficients=own.stress_coefficients, gradient=own.stress_gradient)
-    return SimpleNamespace(**vars(own) | vars(correction(own, name)))
+    return SimpleNamespace(**vars(own) | vars(correction(own, name, kind)))
 
 
-def correction(own: SimpleNamespace, name: str) -> SimpleNamespace:
-    """Return features, value and adjoints of the correction, from the functions of `network_kernels` or `bounded_kernels`."""
+def correction(own: SimpleNamespace, name: str, kind: str) -> SimpleNamespace:
+    """Return features, value and adjoints of the correction of a kind, from the functions of `network_kernels` or `bounded_kernels`."""
+    if kind == RETURN:
+        own = SimpleNamespace(**vars(own) | vars(return_kernels.functions(own, wp.float32, name)))
     vec4, mat33, correction_coefficients = own.vec4, own.mat33, own.correction_coefficients
 
     @wp.func(module=name)
@@ -100,7 +102,7 @@ def networks(width: int, name: str) -> SimpleNamespace:
 
 @cached
 def build(width: int, kind: str) -> SimpleNamespace:
-    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `CORRECTION` or `BOUNDED`."""
+    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `BOUNDED`, `CORRECTION` or `RETURN`."""
     start_warp()
     name = f"neuido.fused.{width}.{kind}"
     # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions

@@ -12,6 +12,7 @@ Details"). There are two kinds, and a third in `bounded`:
 activations. Calling a law evaluates it in plain torch, which autograd differentiates.
 """
 
+import copy
 import threading
 from collections.abc import Hashable, Sequence
 from typing import Self
@@ -47,13 +48,7 @@ STRAIN_SCALE = 1e-2
 
 
 def launch(kernel, like: Tensor, *arguments) -> None:
-    """Launch a kernel on torch's current stream.
-
-    Args:
-        kernel: The kernel.
-        like: A tensor on the device of the launch, with one row for each thread.
-        arguments: Arguments of the kernel.
-    """
+    """Launch a kernel on torch's current stream, with one thread for each row of `like`, on its device."""
     with torch_stream(like.device):
         device.launch(kernel, like.shape[0], arguments, like.device)
 
@@ -167,11 +162,16 @@ def return_map(F: Tensor, c: Tensor, scale: float = STRAIN_SCALE) -> Tensor:
     l, A, q = hencky_strain(F)
     f = (1 - (scale * c[..., 0] + c[..., 1] * (-l).clamp(min=0)) / q).clamp(0, 1)
     u = torch.minimum((l - scale * c[..., 2]).clamp(min=0), l) * (l > 0)
+    return taken_back(F, f[..., None, None] * A, u)
+
+
+def taken_back(F: Tensor, deviator: Tensor, volume: Tensor) -> Tensor:
+    """Return exp(-volume/3) exp(-deviator) F, (..., 3, 3), of a symmetric deviator (..., 3, 3) and a volume (...) of the Hencky strain."""
     eye = torch.eye(3, dtype=F.dtype, device=F.device)
-    Y = -0.25 * f[..., None, None] * A
+    Y = -0.25 * deviator
     E = eye + Y @ (eye + Y / 2 @ (eye + Y / 3 @ (eye + Y / 4)))
     E = E @ E
-    return (-u / 3).exp()[..., None, None] * (E @ E @ F)
+    return (-volume / 3).exp()[..., None, None] * (E @ E @ F)
 
 
 # The network: features (P, 9) -> outputs (P, n), with buffers that laws of the same size share.
@@ -233,7 +233,13 @@ class _Network(Law):
         """Return this law with its outputs (of an elastic law, the stress) times a factor per scene, (S,); the last layer is linear."""
         *hidden, W3, b3 = self.weights
         factor = factor.to(W3)
-        return type(self)(*hidden, factor[:, None, None] * W3, factor[:, None] * b3, scale=self.scale)
+        return self._with(*hidden, factor[:, None, None] * W3, factor[:, None] * b3)
+
+    def _with(self, *weights: Tensor) -> Self:
+        """Return a copy of this law with other weights."""
+        law = copy.copy(self)
+        law.weights = weights  # type: ignore[assignment]
+        return law
 
     def engine(self, tensors: Sequence[Tensor], particles: Particles) -> Engine:
         """Return an engine with fused kernels where they exist (CUDA, float32, some widths), else the general one."""
@@ -328,7 +334,7 @@ class _Raw(_Network):
 class _Objective(_Network):
     strain_limit = STRAIN_LIMIT
     readout: str
-    """Read-out of the fused kernels, one of `fused.STRESS`, `fused.CORRECTION` and `fused.BOUNDED`."""
+    """Read-out of the fused kernels, one of `fused.STRESS`, `fused.BOUNDED`, `fused.CORRECTION` and `fused.RETURN`."""
     kernels = staticmethod(kernels)
     """The kernels of features and read-out for the scalar type of a tensor."""
 
@@ -429,13 +435,13 @@ class ObjectivePlastic(_Objective, PlasticLaw):
 
     def forward(self, tensors, F, out, particles=None) -> None:
         w = self._evaluate(tensors, F, particles)
-        launch(kernels(F).correction, F, F, w.y, self.scale, out)
+        launch(self.kernels(F).correction, F, F, w.y, self.scale, out)
 
     def adjoint(self, tensors, F, grad_out, grad_F, grad_tensors, particles=None) -> None:
         w = self._evaluate(tensors, F, particles)
-        launch(kernels(F).correction_coefficients_adjoint, F, F, w.y, self.scale, 0, grad_out, w.gy)
+        launch(self.kernels(F).correction_coefficients_adjoint, F, F, w.y, self.scale, 0, grad_out, w.gy)
         self._backpropagate(w, tensors, grad_tensors, F, particles)
-        launch(kernels(F).correction_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
+        launch(self.kernels(F).correction_adjoint, F, F, w.y, self.scale, grad_out, w.gx, grad_F)
 
     def __call__(self, F: Tensor, particles: Particles | None = None) -> Tensor:
         return self.corrected_of(F, self._twin(self.features_of(F), particles), self.scale)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from neuido.physics.laws.neural import network_kernels
-from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, kernels, launch
+from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic, launch
 
 
 class StressReadout(torch.autograd.Function):
@@ -27,25 +27,25 @@ class StressReadout(torch.autograd.Function):
 
 
 class CorrectionReadout(torch.autograd.Function):
-    """`return_map` by a Warp kernel, differentiable with respect to the coefficients c (B, 3) alone.
+    """The correction of a law by a Warp kernel, differentiable with respect to the coefficients c (B, n) alone.
 
     Where a clamp is active, the gradient is passed if descent moves the value back into the range; without that, a radius outside the
     range would never learn. The gradient is zero if descent would move the value further out.
     """
 
     @staticmethod
-    def forward(ctx, c: Tensor, F: Tensor, scale: float) -> Tensor:
+    def forward(ctx, c: Tensor, F: Tensor, law: type[ObjectivePlastic]) -> Tensor:
         c, out = c.detach().contiguous(), torch.empty_like(F)
-        launch(kernels(F).correction, F, F, c, scale, out)
+        launch(law.kernels(F).correction, F, F, c, law.unit, out)
         ctx.save_for_backward(F, c)
-        ctx.scale = scale
+        ctx.law = law
         return out
 
     @staticmethod
     def backward(ctx, grad: Tensor):
         F, c = ctx.saved_tensors
         out = torch.empty_like(c)
-        launch(kernels(F).correction_coefficients_adjoint, F, F, c, ctx.scale, 1, grad.contiguous(), out)
+        launch(ctx.law.kernels(F).correction_coefficients_adjoint, F, F, c, ctx.law.unit, 1, grad.contiguous(), out)
         return out, None, None
 
 
