@@ -1,4 +1,8 @@
-"""The three material families of the training data (elastic, plasticine, sand): parameter ranges, random draws and laws."""
+"""The material families of the training data: parameter ranges, random draws, laws, and the effects that depend on the rate.
+
+`elastic`, `plasticine` and `sand` are those of the paper. `rubber` is Mooney-Rivlin, `foam` Ogden-Hill, `fluid` Newtonian and weakly
+compressible, `viscoplastic` Herschel-Bulkley (honey, paste), `snow` Stomakhin's.
+"""
 
 import math
 from collections.abc import Mapping
@@ -10,30 +14,55 @@ from torch import Tensor
 
 from neuido.data.files.values import file_name, mapping, number, require_key
 from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, Sigma, VonMises
+from neuido.physics.laws.hyperelastic import Fluid, Hyperfoam, MooneyRivlin
+from neuido.physics.laws.parametric import lame
+from neuido.physics.laws.resets import Snow, VolumetricReset
 from neuido.types import Particles
 
 PARAMETERS = {
     "elastic": ("young", "poisson"),
     "plasticine": ("young", "poisson", "yield_stress"),
     "sand": ("young", "poisson", "friction_angle"),
+    "rubber": ("young", "poisson", "share"),
+    "foam": ("young", "poisson", "exponent"),
+    "fluid": ("bulk", "viscosity"),
+    "viscoplastic": ("young", "poisson", "yield_stress", "viscosity", "index"),
+    "snow": ("young", "poisson", "compression", "stretch", "hardening"),
 }
-LOGARITHMIC = ("young", "yield_stress")
-LIMITS = {"young": (0.0, math.inf), "poisson": (-1.0, 0.5), "yield_stress": (0.0, math.inf), "friction_angle": (0.0, 90.0)}
+"""Parameters of each family: young, bulk and yield_stress [Pa], friction_angle [degrees], viscosity [Pa s], the others [-]. `share` is
+c01/(c10 + c01) of Mooney-Rivlin, `exponent` Ogden's; viscosity and `index` n make the shear stress viscosity r (r/r0)^(n - 1) of a shear
+rate r, r0 = 1/s; `compression` and `stretch` bound the elastic stretches of snow, and `hardening` is Stomakhin's xi."""
+LOGARITHMIC = ("young", "yield_stress", "bulk", "viscosity")
+LIMITS = {
+    "young": (0.0, math.inf),
+    "poisson": (-1.0, 0.5),
+    "yield_stress": (0.0, math.inf),
+    "friction_angle": (0.0, 90.0),
+    "share": (0.0, 1.0),
+    "exponent": (0.0, math.inf),
+    "bulk": (0.0, math.inf),
+    "viscosity": (0.0, math.inf),
+    "index": (0.1, math.inf),
+    "compression": (0.0, 1.0),
+    "stretch": (0.0, math.inf),
+    "hardening": (0.0, math.inf),
+}
 PUBLISHED = {
     "elastic": ("jelly", {"young": 1e5, "poisson": 0.2}),
     "plasticine": ("plasticine", {"young": 3e5, "poisson": 0.25, "yield_stress": 5e3}),
     "sand": ("sand", {"young": 1e6, "poisson": 0.2, "friction_angle": 25.0}),
 }
-"""NCLaw's published materials (its experiments/configs/env/blob), instance 0 of each family."""
+"""NCLaw's published materials (its experiments/configs/env/blob), instance 0 of a family; the other families have none."""
 
 
 def check_ranges(family: str, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Check the parameter ranges of a material family.
 
     Args:
-        family: `elastic`, `plasticine` or `sand`.
+        family: One of `PARAMETERS`.
         ranges: (low, high) of each parameter in `PARAMETERS[family]`.
 
     Raises:
@@ -65,7 +94,7 @@ def check_entry(entry: dict[str, Any], where: str) -> None:
 
 
 def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], random: np.random.Generator) -> dict[str, float]:
-    """Draw random parameters of a family: `young` and `yield_stress` log-uniformly over their ranges, the others uniformly."""
+    """Draw random parameters of a family: those of `LOGARITHMIC` log-uniformly over their ranges, the others uniformly."""
     drawn = {}
     for name in PARAMETERS[family]:
         low, high = ranges[name]
@@ -75,17 +104,55 @@ def draw_parameters(family: str, ranges: Mapping[str, tuple[float, float]], rand
 
 
 def laws(family: str, parameters: list[dict[str, float]]) -> tuple[ElasticLaw, PlasticLaw]:
-    """Build the batched elastic and plastic law of S materials of one family.
+    """Build the batched elastic and plastic law of S materials of one family; `effects` returns what depends on the rate.
 
     Args:
-        family: `elastic`, `plasticine` or `sand`.
-        parameters: Parameters of each of the S materials: young and yield_stress [Pa], poisson [-], friction_angle [degrees].
+        family: One of `PARAMETERS`.
+        parameters: Parameters of each of the S materials, as in `PARAMETERS`.
     """
-    columns = {name: torch.tensor([p[name] for p in parameters], dtype=torch.float64) for name in PARAMETERS[family]}
-    stiffness = {name: columns[name] for name in ("young", "poisson")}
+    given = _columns(family, parameters)
+    if family == "fluid":
+        return Fluid(given["bulk"]), VolumetricReset()
+    stiffness = {name: given[name] for name in ("young", "poisson")}
+    shear, _ = lame(**stiffness)
     if family == "elastic":
         return FixedCorotated(**stiffness), Identity()
-    return Sigma(**stiffness), VonMises(**columns) if family == "plasticine" else DruckerPrager(**columns)
+    if family == "rubber":
+        bulk = given["young"] / (3 * (1 - 2 * given["poisson"]))
+        return MooneyRivlin(shear / 2 * (1 - given["share"]), shear / 2 * given["share"], bulk), Identity()
+    if family == "foam":
+        return Hyperfoam(shear, given["exponent"], given["poisson"]), Identity()
+    if family == "snow":
+        return FixedCorotated(**stiffness), Snow(given["compression"], given["stretch"])
+    if family == "sand":
+        return Sigma(**stiffness), DruckerPrager(given["friction_angle"], **stiffness)
+    return Sigma(**stiffness), VonMises(given["yield_stress"], **stiffness)
+
+
+def effects(family: str, parameters: list[dict[str, float]]) -> Effects | None:
+    """Return the effects beside the laws of S materials of one family, for `Simulator.rollout(..., effects=)`; None without any.
+
+    A fluid has a viscosity; a viscoplastic material a rate-dependent yield stress with a power-law index; snow hardens as it is compacted.
+
+    Args:
+        family: One of `PARAMETERS`.
+        parameters: As for `laws`.
+    """
+    given = _columns(family, parameters)
+    if family == "fluid":
+        return Effects(viscosity_shear=given["viscosity"])
+    if family == "viscoplastic":
+        # the norms of stress and strain rate in simple shear are sqrt(2) times the shear stress and 1/sqrt(2) times the shear rate
+        index = given["index"]
+        return Effects(rate_yield=given["viscosity"] * 2 ** ((index + 1) / 2), yield_index=index)
+    if family == "snow":
+        return Effects(compaction_hardening=given["hardening"])
+    return None
+
+
+def _columns(family: str, parameters: list[dict[str, float]]) -> dict[str, Tensor]:
+    """Return each parameter of a family as a tensor (S,)."""
+    return {name: torch.tensor([p[name] for p in parameters], dtype=torch.float64) for name in PARAMETERS[family]}
 
 
 def evaluate(law: ElasticLaw | PlasticLaw, F: Tensor) -> Tensor:

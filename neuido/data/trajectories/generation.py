@@ -249,7 +249,7 @@ def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: P
 
 
 def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:
-    if number == 0:
+    if number == 0 and family in PUBLISHED:
         name, parameters = PUBLISHED[family]
         return Instance(name, family, dict(parameters), split)
     random = np.random.default_rng([setup.seed, list(PARAMETERS).index(family), number])

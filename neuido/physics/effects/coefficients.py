@@ -36,7 +36,7 @@ SPACING, DECADES = 1.535, 6
 
 
 class Layout(NamedTuple):
-    """Columns of the history of each particle, (P, width): 6 per Maxwell branch, alpha, 6 for the backstress, e_max.
+    """Columns of the history of each particle, (P, width): 6 per Maxwell branch, alpha, 6 for the backstress, e_max, ln J_P.
 
     Symmetric matrices are stored as xx, yy, zz, xy, xz, yz.
     """
@@ -49,6 +49,8 @@ class Layout(NamedTuple):
     """Whether the backstress is stored."""
     e_max: bool = False
     """Whether e_max, the largest norm of the deviatoric Hencky strain so far, is stored."""
+    compaction: bool = False
+    """Whether ln J_P, the logarithm of the plastic change of volume, is stored."""
 
     @property
     def alpha_column(self) -> int:
@@ -66,9 +68,14 @@ class Layout(NamedTuple):
         return 6 * self.branches + self.alpha + 6 * self.backstress if self.e_max else -1
 
     @property
+    def compaction_column(self) -> int:
+        """Column of ln J_P, -1 where absent."""
+        return self.width - 1 if self.compaction else -1
+
+    @property
     def width(self) -> int:
         """Number of columns."""
-        return 6 * self.branches + self.alpha + 6 * self.backstress + self.e_max
+        return 6 * self.branches + self.alpha + 6 * self.backstress + self.e_max + self.compaction
 
 
 class Tables(NamedTuple):
@@ -76,15 +83,17 @@ class Tables(NamedTuple):
 
     layout: Layout
     material: Tensor | None
-    """(S, 9): mu k of `strain_stiffening`, mu c of `second_invariant`, 2 mu r of `tension_compression`, c of `fibre` [Pa each], the unit
-    direction of the fibres x, y, z [-], s of damage (`softening` without yield) [-], and k of `strain_stiffening` [-]."""
+    """(S, 10): mu k of `strain_stiffening`, mu c of `second_invariant`, 2 mu r of `tension_compression`, c of `fibre` [Pa each], the unit
+    direction of the fibres x, y, z [-], s of damage (`softening` without yield) [-], k of `strain_stiffening` [-], xi of
+    `compaction_hardening` [-]."""
     spectral: bool
     """Whether the stress needs principal strains (`tension_compression`)."""
     branches: Tensor | None
     """(S, B, 2): 2 g mu [Pa] and relaxation time [s] of each Maxwell branch, with g the branch's share of the shear modulus."""
     flow: Tensor | None
-    """(S, 8): 2 mu [Pa], 1/yield stress [1/Pa] (0: no yield), H of `hardening` [Pa], s of `softening` [-], H_k of `kinematic_hardening`
-    [Pa], eta of `rate_yield` [Pa s], slope of the Drucker-Prager cone in Hencky strain [-], volumetric strain of the cone's tip [-]."""
+    """(S, 9): 2 mu [Pa], 1/yield stress [1/Pa] (0: no yield), H of `hardening` [Pa], s of `softening` [-], H_k of `kinematic_hardening`
+    [Pa], eta of `rate_yield` [Pa s], slope of the Drucker-Prager cone in Hencky strain [-], volumetric strain of the cone's tip [-], n of
+    `yield_index` [-]."""
     kinds: tuple[int, ...]
     """Kind of plastic flow of each scene: `NO_FLOW`, `VON_MISES` or `DRUCKER_PRAGER`."""
     stiffening: Tensor
@@ -176,6 +185,8 @@ def _flow(
         raise UserError("cohesion needs a declared drucker_prager plasticity, whose cone it moves; declare it or leave cohesion out")
     if of_yield and any(kind != NO_FLOW for kind in base):
         raise UserError("yield_inverse needs an elastic body, and the declared plasticity yields already; leave one of them out")
+    if effects.yield_index is not None and effects.rate_yield is None:
+        raise UserError("yield_index is the exponent of rate_yield: give rate_yield too")
     if given and any(kind not in (NO_FLOW, VON_MISES) for kind in base):
         raise UserError(f"{given[0]} needs a declared von_mises plasticity, or an elastic body")
     flowing = [name for name in given if name != "softening"]
@@ -200,8 +211,11 @@ def _flow(
     a = torch.where(is_cone, radius, 0.1 * bulk3 / mu) * 2 * mu / bulk3 / math.sqrt(2 / 3)
     sine = 3 * a / (2 + a)
     tip = torch.where(is_cone, 3 * column["cohesion"] * torch.sqrt(1 - sine**2) / sine / bulk3, 0.0)
-    columns = [2 * mu, inverse, column["hardening"], column["softening"], column["kinematic_hardening"], column["rate_yield"], slope, tip]
-    return torch.stack(columns, dim=1), kinds
+    index = torch.ones_like(tip)
+    if effects.yield_index is not None:
+        index = effects.rows("yield_index", count, like)[:, 0]
+    given_columns = [column[name] for name in ("hardening", "softening", "kinematic_hardening", "rate_yield")]
+    return torch.stack([2 * mu, inverse, *given_columns, slope, tip, index], dim=1), kinds
 
 
 def tables(
@@ -236,6 +250,11 @@ def tables(
     alone = {name.partition(".")[0]: None for name in effects.point or {}}
     if not point and (refused := [name for name in alone if name not in BODIES_TOO]):
         raise UserError(f"{refused[0]} is an effect of material tests, and no body has it yet: leave it out")
+    for name in ("yield_index", "compaction_hardening"):
+        if point and getattr(effects, name) is not None:
+            raise UserError(f"{name} is an effect of bodies, and no material test has it yet: leave it out")
+    if effects.compaction_hardening is not None and (plasticity is None or plasticity.identity):
+        raise UserError("compaction_hardening needs a plastic law that changes the volume, such as snow: declare one or leave it out")
     if not effects.changes_law:
         return Tables(Layout(), None, False, None, None, (), like.new_zeros(count))
     mu = torch.as_tensor(shear_modulus(elasticity) if shear is None else shear, dtype=like.dtype, device=like.device)
@@ -251,6 +270,7 @@ def tables(
         flow is not None and (effects.hardening is not None or effects.softening is not None),
         flow is not None and effects.kinematic_hardening is not None,
         damages,
+        effects.compaction_hardening is not None,
     )
     return Tables(layout, material, effects.tension_compression is not None, branches, flow, kinds, stiff.detach())
 
@@ -302,7 +322,7 @@ def _material(effects: Effects, count: int, like: Tensor, mu: Tensor, flow: Tens
     """Return `Tables.material`, and what its effects add to the P-wave modulus [Pa], (S,)."""
     names = ("strain_stiffening", "second_invariant", "tension_compression", "fibre")
     zero = like.new_zeros(count)
-    if not damages and all(getattr(effects, name) is None for name in names):
+    if not damages and all(getattr(effects, name) is None for name in (*names, "compaction_hardening")):
         return None, zero
     damage = zero
     if effects.softening is not None:
@@ -317,5 +337,6 @@ def _material(effects: Effects, count: int, like: Tensor, mu: Tensor, flow: Tens
             raise UserError("fibre_direction is zero; give a vector of any length")
         direction = direction / size
     k, c, r, f = (effects.rows(name, count, like)[:, 0] for name in names)
-    material = torch.cat([torch.stack([mu * k, mu * c, 2 * mu * r, f], dim=1), direction, damage[:, None], k[:, None]], dim=1)
+    xi = effects.rows("compaction_hardening", count, like)
+    material = torch.cat([torch.stack([mu * k, mu * c, 2 * mu * r, f], dim=1), direction, damage[:, None], k[:, None], xi], dim=1)
     return material, 4 / 3 * mu * c + 2 * mu * r.clamp(min=0) + 2 * f

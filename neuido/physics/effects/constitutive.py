@@ -12,6 +12,7 @@ from torch import Tensor
 
 from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import DRUCKER_PRAGER, VON_MISES
+from neuido.physics.effects.history_functions import COMPACTED
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.laws.classical_kernels import LOCKED
@@ -31,6 +32,8 @@ class History(NamedTuple):
     """Kirchhoff backstress [Pa], (P, 3, 3)."""
     e_max: Tensor
     """Largest norm of the deviatoric Hencky strain so far [-], (P,)."""
+    compaction: Tensor
+    """Logarithm of the plastic change of volume J_P [-], (P,)."""
 
 
 def spin(C: Tensor, dt: Tensor | float) -> Tensor:
@@ -93,6 +96,28 @@ def compressive(F: Tensor) -> Tensor:
     return linalg.isotropic_stress(F, at, e, slopes)
 
 
+def plastic_step(over: Tensor, total: Tensor, eta: Tensor, index: Tensor, dt: Tensor) -> Tensor:
+    """Return the step g of plastic flow that solves over = total g + eta (g/dt)^index, (P,), differentiable.
+
+    Args:
+        over: Overstress of the trial [Pa], (P,), > 0.
+        total: Sum of the moduli that resist the flow [Pa], (P,).
+        eta: Viscosity [Pa s], (P,).
+        index: Exponent [-], (P,).
+        dt: Step [s], (P,).
+    """
+    with torch.no_grad():
+        low, high = torch.zeros_like(over), over / total
+        for _ in range(100):  # bisection, so that the twin shares no method with the kernel
+            middle = (low + high) / 2
+            beyond = total * middle + eta * (middle / dt) ** index > over
+            low, high = torch.where(beyond, low, middle), torch.where(beyond, middle, high)
+        found = high
+        slope = total + eta * index * (found / dt) ** (index - 1) / dt
+    # a step of Newton's method from the solution: it changes nothing, and has the derivatives of the implicit function
+    return found - (total * found + eta * (found / dt) ** index - over) / slope
+
+
 class Constitutive:
     """Elasticity, plasticity and effects of P particles.
 
@@ -146,7 +171,8 @@ class Constitutive:
     def start(self) -> History:
         """Return a history of zeros."""
         zero = self.like.new_zeros
-        return History(zero(self.count, self.tables.layout.branches, 3, 3), zero(self.count), zero(self.count, 3, 3), zero(self.count))
+        rows = [zero(self.count) for _ in range(3)]
+        return History(zero(self.count, self.tables.layout.branches, 3, 3), rows[0], zero(self.count, 3, 3), *rows[1:])
 
     def _scale(self, time: Tensor | float) -> Tensor:
         """Return the factor of the elastic stress that does not depend on the history, (P,)."""
@@ -180,7 +206,7 @@ class Constitutive:
             tau = tau + further
         scale = self._scale(time) * factor
         if self.tables.material is not None:
-            k, c, r, fibre, x, y, z, damage, lock = self.tables.material[self.scene][..., None, None].unbind(1)
+            k, c, r, fibre, x, y, z, damage, lock, xi = self.tables.material[self.scene][..., None, None].unbind(1)
             J = torch.linalg.det(F)[:, None, None]
             bbar = J ** (-2 / 3) * (F @ F.mT)
             I1 = bbar.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
@@ -193,6 +219,8 @@ class Constitutive:
                 tau = tau + r * compressive(F)
             if self.tables.layout.e_max:
                 scale = scale * torch.exp(-damage[:, 0, 0] * history.e_max)
+            if self.tables.layout.compaction:
+                scale = scale * torch.exp(xi[:, 0, 0] * (-torch.expm1(history.compaction)).clamp(max=1 - COMPACTED))
         if self.tables.branches is not None:
             tau = tau + (self.tables.branches[self.scene, :, 0, None, None] * history.branches).sum(1)
         tau = scale[:, None, None] * tau
@@ -235,12 +263,16 @@ class Constitutive:
             F = trial if self.plasticity is None else self.plasticity(trial, self.particles)
         if layout.e_max:
             history = history._replace(e_max=torch.maximum(history.e_max, _norm(deviator(hencky(F)))))
+        if layout.compaction:
+            before, after = (torch.linalg.det(A).clamp(min=FLOOR).log() for A in (trial, F))
+            history = history._replace(compaction=history.compaction + before - after)
         return F, history
 
     def _flow(self, row: Tensor, trial: Tensor, history: History, dt: Tensor, scale: Tensor) -> tuple[Tensor, History]:
         F = trial
         if VON_MISES in self.tables.kinds:
             two_mu, inverse, H, s, H_k, eta = row[:, :6].unbind(1)
+            index = row[:, 8]
             two_mu = two_mu * scale
             xi = two_mu[:, None, None] * deviator(hencky(trial)) - history.backstress
             q = _norm(xi)
@@ -248,7 +280,8 @@ class Constitutive:
             limited = (inverse > 0) & (self._kinds == VON_MISES)
             limit = (1 / torch.where(limited, inverse, 1.0) + H * history.alpha) * soft
             flows = limited & (q > limit)
-            increment = torch.where(flows, (q - limit) / (two_mu + H_k + H * soft + eta / dt), 0.0)
+            over = torch.where(flows, q - limit, 1.0)
+            increment = torch.where(flows, plastic_step(over, two_mu + H_k + H * soft, eta, index, dt), 0.0)
             direction = xi / torch.where(flows, q, 1.0)[:, None, None]
             step = increment[:, None, None] * direction
             F = torch.where(flows[:, None, None], expm(torch.where(flows[:, None, None], -step, 0.0)) @ trial, F)

@@ -3,10 +3,11 @@
 Von Mises (Simo and Hughes, Computational Inelasticity, chapters 2 and 3, in Hencky strain):
 
     xi = 2 mu dev ln V - beta,   n = xi/|xi|,   yield stress (Y + H alpha) exp(-s alpha)
-    dgamma = max(|xi| - yield stress, 0) / (2 mu + H_k + H exp(-s alpha) + eta/dt)
+    dgamma (2 mu + H_k + H exp(-s alpha)) + eta (dgamma/dt)^n = max(|xi| - yield stress, 0)
     F = exp(-dgamma n) F_tr,   alpha += dgamma,   beta += H_k dgamma n
 
-The step is exact, except that softening is explicit.
+The step is exact, except that softening is explicit. n is `yield_index`; for n = 1 the step has a closed form, otherwise Newton's method
+finds its logarithm.
 
 Drucker-Prager with cohesion: |dev ln V| <= slope (tip - tr ln V); a strain beyond the tip is returned to the tip.
 """
@@ -22,6 +23,9 @@ from neuido.physics.linalg import warp_functions
 from neuido.physics.linalg.warp_functions import GAP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
+
+STEPS = 8
+"""Steps of Newton's method for `yield_index`. It starts within ln 2 of a convex function's root and converges quadratically."""
 
 
 @cached
@@ -47,6 +51,7 @@ def build(real: type) -> SimpleNamespace:
     three = wp.constant(real(3.0))
     gap = wp.constant(real(GAP))
     MISES = wp.constant(classical_kernels.VON_MISES)
+    NEWTON = wp.constant(STEPS)
     CONE = wp.constant(classical_kernels.DRUCKER_PRAGER)
 
     @func
@@ -65,6 +70,28 @@ def build(real: type) -> SimpleNamespace:
         if turned:
             n, Z = eigen(N)
         return n, Z
+
+    @func
+    def plastic_step(over: real, total: real, eta: real, n: real, h: real):
+        """Return dgamma for the overstress over = total dgamma + eta (dgamma/h)^n, over > 0."""
+        out = over / (total + eta / h)
+        if n != one and eta > zero:
+            # ln(total e^y + eta (e^y/h)^n) is convex in y = ln dgamma, and its slope lies between 1 and n
+            y = wp.min(wp.log(over / total), wp.log(h) + wp.log(over / eta) / n)
+            for _step in range(NEWTON):
+                linear = total * wp.exp(y)
+                power = eta * wp.exp(n * (y - wp.log(h)))
+                y -= wp.log((linear + power) / over) * (linear + power) / (linear + n * power)
+            out = wp.exp(y)
+        return out
+
+    @func
+    def step_slope(step: real, total: real, eta: real, n: real, h: real):
+        """Return the derivative of the overstress with respect to dgamma, total + eta n (dgamma/h)^(n - 1)/h."""
+        out = total + eta / h
+        if n != one:
+            out = total + eta * n * wp.pow(step / h, n - one) / h
+        return out
 
     @kernel
     def flow(
@@ -105,7 +132,7 @@ def build(real: type) -> SimpleNamespace:
                 N = overstress(hencky(d), U, beta, two_mu)
                 q = wp.sqrt(wp.ddot(N, N))
                 if q > limit:
-                    step = (q - limit) / (two_mu + table[s, 4] + table[s, 2] * soft + table[s, 5] / dt[s])
+                    step = plastic_step(q - limit, two_mu + table[s, 4] + table[s, 2] * soft, table[s, 5], table[s, 8], dt[s])
                     N = N / q
                     n, Z = principal(N, U, backstress_column >= 0)
                     x = -step * n
@@ -188,8 +215,10 @@ def build(real: type) -> SimpleNamespace:
                 q = wp.sqrt(wp.ddot(X, X))
                 if q > hard * soft:
                     H_k = table[s, 4]
-                    total = two_mu + H_k + table[s, 2] * soft + table[s, 5] / dt[s]
-                    step = (q - hard * soft) / total
+                    eta = table[s, 5]
+                    index = table[s, 8]
+                    total = two_mu + H_k + table[s, 2] * soft
+                    step = plastic_step(q - hard * soft, total, eta, index, dt[s])
                     N = X / q
                     n, Z = principal(N, U, backstress_column >= 0)
                     x = -step * n
@@ -204,8 +233,9 @@ def build(real: type) -> SimpleNamespace:
                     bN = wp.ddot(a_beta, N)
                     a_step = a_alpha + H_k * bN - wp.ddot(S, N)
                     a_N = step * (H_k * a_beta - S)
-                    a_q = a_step / total
+                    a_q = a_step / step_slope(step, total, eta, index, dt[s])
                     a_total = -a_q * step
+                    power = wp.pow(step / dt[s], index)
                     a_X = (one / q) * (a_N - wp.ddot(a_N, N) * N) + a_q * N
                     a_soft = a_total * table[s, 2] - a_q * hard
                     dev = e - mean_of(e)
@@ -216,7 +246,9 @@ def build(real: type) -> SimpleNamespace:
                     wp.atomic_add(a_table, s, 2, a_total * soft - a_q * alpha * soft)
                     wp.atomic_add(a_table, s, 3, -a_soft * alpha * soft)
                     wp.atomic_add(a_table, s, 4, a_total + step * bN)
-                    wp.atomic_add(a_table, s, 5, a_total / dt[s])
+                    wp.atomic_add(a_table, s, 5, -a_q * power)
+                    if power > zero:
+                        wp.atomic_add(a_table, s, 8, -a_q * eta * power * wp.log(step / dt[s]))
                     a_log = a_two_mu * two_mu
                     a_alpha = a_alpha - a_q * table[s, 2] * soft - a_soft * table[s, 3] * soft
                     a_beta = a_beta - a_X

@@ -8,6 +8,10 @@ import warp as wp
 from neuido.physics.linalg import warp_functions
 from neuido.physics.runtime.once import cached
 
+COMPACTED = 0.6
+"""Lower bound of the plastic change of volume J_P in `compaction_hardening`: beyond it snow is ice, and a larger factor would need shorter
+steps. The value is that of the snow of Taichi's examples (Hu et al. 2018)."""
+
 
 class HistoryFunctions(NamedTuple):
     """Warp functions for one scalar type, in one Warp module."""
@@ -34,6 +38,8 @@ class HistoryFunctions(NamedTuple):
     """F -> an upper bound of the norm of dev ln V, without a principal frame"""
     scale_of: Any
     """(p, s, stiffness, growth) -> the factor of `stiffness` and `stiffness_change` on the elastic stress"""
+    compaction_of: Any
+    """ln J_P -> 1 - J_P, bounded above by 1 - COMPACTED"""
 
 
 @cached
@@ -47,6 +53,7 @@ def functions(real: type, module: str) -> HistoryFunctions:
     one = wp.constant(real(1.0))
     two = wp.constant(real(2.0))
     three = wp.constant(real(3.0))
+    largest = wp.constant(real(1.0 - COMPACTED))
 
     @func
     def load(history: wp.array2d(dtype=real), p: int, at: int):
@@ -135,4 +142,10 @@ def functions(real: type, module: str) -> HistoryFunctions:
             out = out * growth[s]
         return out
 
-    return HistoryFunctions(load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of)
+    @func
+    def compaction_of(q: real):
+        return wp.min(one - wp.exp(q), largest)
+
+    return HistoryFunctions(
+        load, store, gather, spread, deviator, half_turn, rotation, add_spin_adjoint, mean_of, bound, scale_of, compaction_of
+    )

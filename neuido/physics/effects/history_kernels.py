@@ -1,4 +1,4 @@
-"""Warp kernels that advance the history of a particle (Maxwell branches, largest strain), with hand-written adjoints.
+"""Warp kernels that advance the history of a particle (Maxwell branches, largest strain, compaction), with hand-written adjoints.
 
 Plastic flow is in `flow_kernels`. `coefficients.Layout` defines the columns of the history, `coefficients.Tables` those of the tables.
 """
@@ -10,6 +10,7 @@ import warp as wp
 
 from neuido.physics.effects import flow_kernels, history_functions
 from neuido.physics.linalg import warp_functions
+from neuido.physics.linalg.warp_functions import FLOOR
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
@@ -20,6 +21,7 @@ def build(real: type) -> SimpleNamespace:
     start_warp()
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     name = f"neuido.history.{real.__name__}"
+    func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     own = warp_functions.functions(real)
     frame, hencky, exp_slope, inverse_stretch = own.frame, own.hencky, own.exp_slope, own.inverse_stretch
@@ -27,8 +29,11 @@ def build(real: type) -> SimpleNamespace:
     load, store, gather, spread, deviator = shared.load, shared.store, shared.gather, shared.spread, shared.deviator
     half_turn, rotation, add_spin_adjoint = shared.half_turn, shared.rotation, shared.add_spin_adjoint
     mean_of, bound = shared.mean_of, shared.bound
+    log1p, volume_change, cofactor, bounded = own.log1p, own.volume_change, own.cofactor, own.bounded
     zero = wp.constant(real(0.0))
     half = wp.constant(real(0.5))
+    one = wp.constant(real(1.0))
+    floor = wp.constant(real(FLOOR))
     two = wp.constant(real(2.0))
 
     @kernel
@@ -128,6 +133,52 @@ def build(real: type) -> SimpleNamespace:
                 a = zero
         a_history[p, at] = a_history[p, at] + a
 
+    @func
+    def log_volume(F: mat33):
+        return log1p(bounded(volume_change(F)))
+
+    @func
+    def log_volume_gradient(F: mat33):
+        out = mat33()
+        J = one + volume_change(F)
+        if J > floor:
+            out = (one / J) * cofactor(F)
+        return out
+
+    @kernel
+    def compact(
+        trial: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        at: int,
+        history: wp.array2d(dtype=real),
+        history_next: wp.array2d(dtype=real),
+    ):
+        """Advance ln J_P by what the plastic law takes from ln det F."""
+        p = wp.tid()
+        history_next[p, at] = history[p, at] + log_volume(trial[p]) - log_volume(F[p])
+
+    @kernel
+    def compact_adjoint(
+        trial: wp.array(dtype=mat33),
+        F: wp.array(dtype=mat33),
+        at: int,
+        a_history_next: wp.array2d(dtype=real),
+        a_trial: wp.array(dtype=mat33),
+        a_F: wp.array(dtype=mat33),
+        a_history: wp.array2d(dtype=real),
+    ):
+        p = wp.tid()
+        a = a_history_next[p, at]
+        a_trial[p] = a_trial[p] + a * log_volume_gradient(trial[p])
+        a_F[p] = a_F[p] - a * log_volume_gradient(F[p])
+        a_history[p, at] = a_history[p, at] + a
+
     return SimpleNamespace(
-        relax=relax, relax_adjoint=relax_adjoint, remember=remember, remember_adjoint=remember_adjoint, **vars(flow_kernels.build(real))
+        relax=relax,
+        relax_adjoint=relax_adjoint,
+        remember=remember,
+        remember_adjoint=remember_adjoint,
+        compact=compact,
+        compact_adjoint=compact_adjoint,
+        **vars(flow_kernels.build(real)),
     )

@@ -40,6 +40,7 @@ def build(real: type) -> SimpleNamespace:
     gap = wp.constant(real(GAP))
     shared = history_functions.functions(real, name)
     load, spread, deviator, scale_of = shared.load, shared.spread, shared.deviator, shared.scale_of
+    compaction_of = shared.compaction_of
 
     @func
     def volume_factor(F: mat33):
@@ -123,11 +124,14 @@ def build(real: type) -> SimpleNamespace:
         material: wp.array2d(dtype=real),
         history: wp.array2d(dtype=real),
         e_max_column: int,
+        compaction_column: int,
     ):
-        """Return the factor on the stress: stiffness, growth and damage."""
+        """Return the factor on the stress: stiffness, growth, damage and compaction."""
         out = scale_of(p, s, stiffness, growth)
         if e_max_column >= 0 and material[s, 7] != zero:
             out = out * wp.exp(-material[s, 7] * history[p, e_max_column])
+        if compaction_column >= 0:
+            out = out * wp.exp(material[s, 9] * compaction_of(history[p, compaction_column]))
         return out
 
     @kernel
@@ -139,6 +143,7 @@ def build(real: type) -> SimpleNamespace:
         branches: wp.array3d(dtype=real),
         spectral: bool,
         e_max_column: int,
+        compaction_column: int,
         all_branches: bool,
         F: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
@@ -148,7 +153,7 @@ def build(real: type) -> SimpleNamespace:
         p = wp.tid()
         s = scene[p]
         t = unscaled_stress(p, s, tau, F, material, branches, spectral, all_branches, history)
-        tau[p] = total_scale(p, s, stiffness, growth, material, history, e_max_column) * t
+        tau[p] = total_scale(p, s, stiffness, growth, material, history, e_max_column, compaction_column) * t
 
     @kernel
     def add_effect_stress_adjoint(
@@ -159,6 +164,7 @@ def build(real: type) -> SimpleNamespace:
         branches: wp.array3d(dtype=real),
         spectral: bool,
         e_max_column: int,
+        compaction_column: int,
         F: wp.array(dtype=mat33),
         history: wp.array2d(dtype=real),
         base: wp.array(dtype=mat33),
@@ -172,14 +178,14 @@ def build(real: type) -> SimpleNamespace:
     ):
         """Turn a_tau into the adjoint of the base law's stress, and add to the other adjoints.
 
-        `base`, the stress of the base law, is read only with stiffness, growth or damage.
+        `base`, the stress of the base law, is read only with stiffness, growth, damage or compaction.
         """
         p = wp.tid()
         s = scene[p]
         A = a_tau[p]
-        scale = total_scale(p, s, stiffness, growth, material, history, e_max_column)
+        scale = total_scale(p, s, stiffness, growth, material, history, e_max_column, compaction_column)
         G = (real(0.5) * scale) * (A + wp.transpose(A))
-        if stiffness or growth or e_max_column >= 0:
+        if stiffness or growth or e_max_column >= 0 or compaction_column >= 0:
             t = unscaled_stress(p, s, base, F, material, branches, spectral, True, history)
             a_log = scale * wp.ddot(A, t)
             if stiffness:
@@ -189,6 +195,12 @@ def build(real: type) -> SimpleNamespace:
             if e_max_column >= 0:
                 wp.atomic_add(a_material, s, 7, -a_log * history[p, e_max_column])
                 a_history[p, e_max_column] = a_history[p, e_max_column] - a_log * material[s, 7]
+            if compaction_column >= 0:
+                q = history[p, compaction_column]
+                compaction = compaction_of(q)
+                wp.atomic_add(a_material, s, 9, a_log * compaction)
+                if compaction == one - wp.exp(q):
+                    a_history[p, compaction_column] = a_history[p, compaction_column] - a_log * material[s, 9] * wp.exp(q)
         if branches:
             for b in range(branches.shape[1]):
                 wp.atomic_add(a_branches, s, b, 0, wp.ddot(G, load(history, p, 6 * b)))

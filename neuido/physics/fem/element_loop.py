@@ -203,7 +203,8 @@ class Loop:
         elastic.forward(self.smoothed, self.tau)
         if self.material is not None:
             self._launch(self.material.add_effect_stress, elements, scene, f.stiffness, growth, f.material, f.branches, self.spectral,
-                         self.layout.e_max_column, False, self.smoothed, self.history, self.tau)  # fmt: skip
+                         self.layout.e_max_column, self.layout.compaction_column, False, self.smoothed, self.history,
+                         self.tau)  # fmt: skip
         if f.viscosity is not None:
             self._launch(k.add_viscous_stress, elements, scene, f.viscosity, self.C, self.smoothed, self.tau)
         if self.nodal:
@@ -243,6 +244,8 @@ class Loop:
                          layout.backstress_column, self.trial, self.C, self.history, self.F, self.history_next)  # fmt: skip
         if layout.e_max:
             self._launch(k.remember, len(self.F), self.F, layout.e_max_column, self.history, self.history_next)
+        if layout.compaction:
+            self._launch(k.compact, len(self.F), self.trial, self.F, layout.compaction_column, self.history, self.history_next)
 
     def _launch(self, kernel, dim: int, *arguments) -> None:
         launch(kernel, dim, arguments, self.assembly.solver.device)

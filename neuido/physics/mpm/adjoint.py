@@ -135,7 +135,7 @@ def run_backward(
                             [setup.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
             if material is not None and a_material is not None:
                 assert plan.effects is not None  # the kernels of the tables
-                if material.stiffness is not None or material.growth is not None or plan.layout.e_max:
+                if material.stiffness is not None or material.growth is not None or plan.layout.e_max or plan.layout.compaction:
                     elastic.forward(F, other)
                 plan.launch(plan.effects.add_effect_stress_adjoint, len(x),
                             [*stress_inputs(plan, material), F, history, other, a_tau, a_F, a_history, *a_material[:4]])  # fmt: skip
@@ -212,6 +212,8 @@ def update_history_adjoint(
     setup, k = plan.setup, plan.effects
     assert k is not None  # the kernels of the tables
     a_C, a_F, a_history_next = a_next[2:]
+    if plan.layout.compaction:
+        plan.launch(k.compact_adjoint, len(F), [trial, F, plan.layout.compaction_column, a_history_next, a_trial, a_F, a_history])
     if plan.layout.e_max:
         plan.launch(k.remember_adjoint, len(F), [F, plan.layout.e_max_column, history, a_history_next, a_F, a_history])
     if material.flow is not None:

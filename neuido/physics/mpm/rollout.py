@@ -297,7 +297,7 @@ def stress(
 
 def stress_inputs(plan: Plan, material: Material) -> list:
     """Return the first arguments of `add_effect_stress` and its adjoint."""
-    return [plan.setup.particles.scene, *material[:4], plan.spectral, plan.layout.e_max_column]
+    return [plan.setup.particles.scene, *material[:4], plan.spectral, plan.layout.e_max_column, plan.layout.compaction_column]
 
 
 def flow_inputs(plan: Plan, material: Material) -> list:
@@ -327,6 +327,8 @@ def update_history(plan: Plan, material: Material, trial: Tensor, C: Tensor, his
         plan.launch(k.flow, len(F), [*flow_inputs(plan, material), trial, C, history, F, history_next])
     if plan.layout.e_max:
         plan.launch(k.remember, len(F), [F, plan.layout.e_max_column, history, history_next])
+    if plan.layout.compaction:
+        plan.launch(k.compact, len(F), [trial, F, plan.layout.compaction_column, history, history_next])
 
 
 def node_range(plan: Plan, x: Tensor | None) -> slice:

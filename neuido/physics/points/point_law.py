@@ -33,6 +33,7 @@ class PointHistory(NamedTuple):
     alpha: Tensor
     backstress: Tensor
     e_max: Tensor
+    compaction: Tensor
     backs: Tensor
     """Backstresses that saturate [Pa], (P, K, 3, 3)."""
     x_max: Tensor
