@@ -13,14 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, evaluate, laws
+from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, effects, evaluate, laws
 from neuido.data.bodies.shapes import cube
 from neuido.data.files.output_folder import claimed_folder
 from neuido.data.files.writing import atomic_write, is_as_written, sha256_of, write_json
 from neuido.data.progress import Progress
+from neuido.data.trajectories.reference_viscosity import reference_viscosity
 from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, is_complete
 from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.resets import VolumetricReset
+from neuido.physics.linalg.decompositions import polar
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.physics.runtime.events import OUTSIDE, Event
@@ -179,10 +183,18 @@ def _check_steps(setup: Setup, instances: list[Instance]) -> None:
     """Check that the substep is stable for every instance before any is simulated."""
     simulator = Simulator(setup.scene, _body(setup), density=setup.density, device="cpu")
     for instance in instances:
+        given = instance.family, [instance.parameters]
         try:
-            simulator.check_step(laws(instance.family, [instance.parameters])[0])
+            rates = _rate_effects(*given)
+            simulator.check_step(laws(*given)[0], None if rates is None else rates.viscosity(1, simulator.mass))
         except UserError as error:
             raise UserError(f"{instance.name}: {error}") from error
+
+
+def _rate_effects(family: str, parameters: list[dict[str, float]]) -> Effects | None:
+    """Return the effects of a family without the hardening of snow: samples of F and stress do not know its history."""
+    given = effects(family, parameters)
+    return None if given is None or given.compaction_hardening is not None else given
 
 
 def _segment(setup: Setup) -> int:
@@ -199,7 +211,8 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
     noted: dict[tuple[int, str], Event] = {}
     frames, count, _ = setup.shape
     body = _body(setup)
-    elastic, plastic = laws(group[0].family, [instance.parameters for instance in group])
+    given = group[0].family, [instance.parameters for instance in group]
+    (elastic, plastic), rates = laws(*given), _rate_effects(*given)
     exact = [laws(instance.family, [instance.parameters]) for instance in group]
     segment = _segment(setup)
     names = group[0].name if len(group) == 1 else f"{group[0].name} .. {group[-1].name}"
@@ -214,7 +227,7 @@ def _simulate(setup: Setup, group: list[Instance], paths: list[Path], device: to
                 np.lib.format.write_array_header_1_0(file, header)
             for start in range(0, frames * setup.record_every, segment):
                 steps = min(segment, frames * setup.record_every - start)
-                out = simulator.rollout(steps, elastic, plastic, state=state)
+                out = simulator.rollout(steps, elastic, plastic, state=state, effects=rates)
                 state = ParticleState(*(part[-1].clone() for part in out))
                 for event in out.events:
                     _merge(noted, event._replace(first=event.first - event.scene * count), start, setup.dt)
@@ -239,11 +252,14 @@ def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: P
     """Compute the recorded columns (T, P, 27) from the frames F, C (K, P, 3, 3) of a rollout.
 
     The targets are the laws evaluated in float64 at the stored float32 inputs, so they are exact for these inputs. The F of the rollout
-    itself differs by rounding.
+    itself differs by rounding. The correction of a fluid keeps the rotation of the trial gradient here, which its stress does not feel:
+    so it is frame-indifferent, as those of the other families are.
     """
     last = torch.arange(setup.record_every, len(F), setup.record_every, device=F.device)
     trial = (F[last - 1].double() + setup.dt * C[last].double() @ F[last - 1].double()).float()
     corrected = evaluate(plastic, trial)
+    if isinstance(plastic, VolumetricReset):
+        corrected = (polar(trial.double())[0] @ corrected.double()).float()
     stress = evaluate(elastic, corrected)
     return torch.cat([part.flatten(-2) for part in (trial, corrected, stress)], dim=-1)
 
@@ -260,8 +276,15 @@ def _write_index(folder: Path, setup: Setup, instances: list[Instance]) -> None:
     from neuido.installation import __version__
 
     files = {instance.name: folder / f"{instance.name}.npy" for instance in instances}
-    entries = [{**asdict(i), **_statistics(files[i.name]), "sha256": sha256_of(files[i.name])} for i in instances]
+    entries = [
+        {**asdict(i), **_statistics(files[i.name]), "viscosity": _viscosity(i), "sha256": sha256_of(files[i.name])} for i in instances
+    ]
     write_json(folder / "index.json", {"format": FORMAT, "version": __version__, "setup": asdict(setup), "trajectories": entries})
+
+
+def _viscosity(instance: Instance) -> float:
+    """Return the `reference_viscosity` of an instance [Pa s]."""
+    return reference_viscosity(_rate_effects(instance.family, [instance.parameters]))
 
 
 def _statistics(path: Path) -> dict[str, float]:

@@ -165,11 +165,10 @@ def fit_latents(
 class ConstitutiveMetrics(nn.Module):
     """Stress MSE [Pa^2] and plastic MSE (mean over components, as in the paper's Table 3), and median relative errors.
 
-    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over the samples that yield, and
-    `stress_error/<family>` and `plastic_error/<family>` over the samples of a family. The scores of trivial predictors are included for
-    comparison: `stress_mse_zero` and `stress_error_zero/<family>` predict zero stress; `plastic_mse_identity`,
-    `plastic_error_yielding_identity` and `plastic_error_identity/<family>` predict no plastic correction. Memory is constant in the number
-    of samples.
+    `stress_error` and `plastic_error` are medians over all samples, `plastic_error_yielding` over the samples that yield, and those with
+    `/<family>` over the samples of a family. The scores of trivial predictors are included for comparison: `stress_mse_zero` and
+    `stress_error_zero/<family>` predict zero stress; `plastic_mse_identity`, `plastic_error_yielding_identity` and
+    `plastic_error_identity/<family>` predict no plastic correction. Memory is constant in the number of samples.
 
     Args:
         prefix: Prefix of the metric names, e.g. `val/`.
@@ -192,6 +191,7 @@ class ConstitutiveMetrics(nn.Module):
         self.stress_by_family = by_family.clone(prefix=f"{prefix}stress_error/")
         self.plastic_by_family = by_family.clone(prefix=f"{prefix}plastic_error/")
         self.zero_by_family = by_family.clone(prefix=f"{prefix}stress_error_zero/")
+        self.yielding_by_family = by_family.clone(prefix=f"{prefix}plastic_error_yielding/")
         self.unchanged_by_family = by_family.clone(prefix=f"{prefix}plastic_error_identity/")
 
     def update(self, answers: OperatorResponse, batch: TrajectoryBatch) -> None:
@@ -212,11 +212,14 @@ class ConstitutiveMetrics(nn.Module):
             rows = [i for i, family in enumerate(self.families) if family == name]
             self.stress_by_family[name].update(answers.stress_error[rows])
             self.plastic_by_family[name].update(answers.plastic_error[rows])
+            self.yielding_by_family[name].update(answers.plastic_error[rows][flows[rows]])
             self.zero_by_family[name].update(zero[rows])
             self.unchanged_by_family[name].update(unchanged[rows])
 
     def compute(self) -> dict[str, Tensor]:
-        return {k: v for m in self._all() for k, v in m.compute().items()}
+        """Return all scores; those of a family that never yields are left out."""
+        scores = {k: v for m in self._all() for k, v in m.compute().items()}
+        return {k: v for k, v in scores.items() if "plastic_error_yielding/" not in k or not bool(v.isnan())}
 
     def reset(self) -> None:
         for collection in self._all():
@@ -224,7 +227,8 @@ class ConstitutiveMetrics(nn.Module):
 
     def _all(self) -> tuple[MetricCollection, ...]:
         whole = self.stress, self.plastic, self.zero, self.yielding, self.unchanged
-        return *whole, self.stress_by_family, self.plastic_by_family, self.zero_by_family, self.unchanged_by_family
+        plastic = self.plastic_by_family, self.yielding_by_family, self.unchanged_by_family
+        return *whole, self.stress_by_family, self.zero_by_family, *plastic
 
 
 def viscosity_scores(prefix: str, predicted: Tensor, target: Tensor, families: Sequence[str]) -> dict[str, Tensor]:

@@ -109,6 +109,7 @@ def test_metrics_by_hand():
     assert values["val/plastic_error/plasticine"].item() == pytest.approx(95, rel=0.05)
     flows = (batch.corrected - batch.trial).flatten(1).norm(dim=1) > 1e-5
     assert not flows[:64].any() and flows[64:].any()
+    assert "val/plastic_error_yielding/elastic" not in values and values["val/plastic_error_yielding/plasticine"] > 64
     assert values["val/plastic_error_yielding"].item() == pytest.approx(torch.arange(128.0)[flows].median().item(), rel=0.05)
 
 
