@@ -14,6 +14,7 @@ from neuido.data.bodies import families
 from neuido.data.trajectories import generation as generate
 from neuido.data.trajectories import trajectory_files
 from neuido.data.trajectories.options import FAMILIES, make_trajectories
+from neuido.data.trajectories.reference_viscosity import REFERENCE_RATE, reference_viscosity
 from neuido.errors import UserError
 
 from .conftest import TINY
@@ -209,3 +210,25 @@ def test_folders_that_cannot_be_written(folder, tmp_path):
         make_trajectories(str(tmp_path / "file" / "below"), **TINY)
     with pytest.raises(UserError, match=r"other options \(steps is 30 there and 31 here\)"):
         make_trajectories(str(folder), **(TINY | {"steps": 31}))
+
+
+@pytest.mark.slow
+def test_a_fluid_forgets_its_shape_and_not_its_rotation(tmp_path):
+    ranges = {"fluid": {"bulk": (1e5, 1e5), "viscosity": (2.0, 2.0)}}
+    make_trajectories(str(tmp_path), **{**TINY, "families": ranges, "instances": 1, "held_out": 0})
+    (entry,) = index(tmp_path)["trajectories"]
+    assert entry["viscosity"] == pytest.approx(2.0)
+    trial, corrected, stress = torch.from_numpy(np.load(tmp_path / f"{entry['name']}.npy")).view(-1, 3, 3, 3).double().unbind(1)
+    J = torch.linalg.det(trial)[:, None, None]
+    eye = torch.eye(3, dtype=trial.dtype).expand_as(trial)
+    torch.testing.assert_close(corrected @ corrected.mT, J ** (2 / 3) * eye, rtol=1e-6, atol=1e-6)  # no shear
+    turned = corrected.mT @ trial
+    torch.testing.assert_close(turned, turned.mT, rtol=1e-6, atol=1e-6)  # the rotation of the trial gradient
+    torch.testing.assert_close(stress, 1e5 / 7 * (J - J**-6) * eye, rtol=1e-3, atol=1.0)
+
+
+def test_a_power_law_counts_at_the_reference_rate():
+    given = {"young": 1e5, "poisson": 0.3, "yield_stress": 1e3, "viscosity": 20.0, "index": 0.5}
+    assert reference_viscosity(families.effects("viscoplastic", [given])) == pytest.approx(20.0 * REFERENCE_RATE**-0.5)
+    assert reference_viscosity(families.effects("viscoplastic", [given | {"index": 1.0}])) == pytest.approx(20.0)
+    assert reference_viscosity(families.effects("sand", [{"young": 1e6, "poisson": 0.2, "friction_angle": 25.0}])) == 0.0
