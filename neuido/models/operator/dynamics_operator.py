@@ -80,7 +80,8 @@ VISCOSITY_UNIT = 1e-3
 """Viscosity at an output of zero of the viscosity head [Pa s]: that of water."""
 
 NEGLIGIBLE = 1e-3
-"""Viscosity up to which a rollout without gradients leaves it out [Pa s]: that of water, not felt by a body of a centimetre or more."""
+"""Viscosity up to which a rollout leaves it out [Pa s]: that of water, not felt by a body of a centimetre or more. As the head gives the
+logarithm, its gradient is as small there."""
 
 VISCOSITY_RANGE = (-20.0, 15.0)
 """Limits of the natural logarithm of the viscosity over its unit: 2e-12 to 3e3 Pa s."""
@@ -227,14 +228,14 @@ class IntrinsicDynamicsOperator(nn.Module):
     def laws(self, z: Tensor) -> tuple[ElasticNetwork, PlasticNetwork]:
         """Return the elastic and plastic law of z (S, d) or (d,) for a rollout of S scenes, differentiable in z and all weights.
 
-        The elastic law has the viscosity of z, which every rollout adds to the effects; none if it is negligible and needs no gradient.
+        The elastic law has the viscosity of z, which every rollout adds to the effects; none if it is negligible.
         """
         z = z.reshape(-1, self.latent_dim)
         elastic, plastic = self.coefficients(z)
         law = self._elastic_law(*_effective(self.elastic_trunk, elastic))
         if self.viscosity_head is not None:
             viscosity = self.viscosity(z)
-            if viscosity.requires_grad or bool((viscosity > NEGLIGIBLE).any()):
+            if bool((viscosity > NEGLIGIBLE).any()):
                 law.viscosity = viscosity
         return law, self._plastic_law(*_effective(self.plastic_trunk, plastic))
 

@@ -6,7 +6,7 @@ import torch
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
-from neuido.physics.laws.neural.bounded import BoundedElastic
+from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
 from neuido.physics.mpm.passes import ClassicalPass, NetworkPass, TransferPass, choose
 from neuido.physics.mpm.plan import FIXED, STATES, Plan
@@ -85,7 +85,10 @@ def test_transfers_by_warp_are_those_by_particle(plastic):
     assert_agree(run(simulator("transfers", WALLS["separate"], torch.float32), laws), twins, torch.float32)
 
 
-def networks(kind, seed: int = 0):
+YIELD = {ObjectivePlastic: [3.0, 0.1, 0.0], FullPlastic: [3.0, 0.1, 0.1, 0.5]}
+
+
+def networks(kind, plastic=ObjectivePlastic, seed: int = 0):
     def laws():
         g = torch.Generator().manual_seed(seed)
 
@@ -93,7 +96,7 @@ def networks(kind, seed: int = 0):
             return (scale * torch.randn(*shape, generator=g)).to(DEVICE)
 
         pair, leaves = [], []
-        for network, bias in ((kind, [0.5, 1.0, 0.0, 0.0]), (ObjectivePlastic, [3.0, 0.1, 0.0])):
+        for network, bias in ((kind, [0.5, 1.0, 0.0, 0.0]), (plastic, YIELD[plastic])):
             last = draw(2, len(bias), 32, scale=2e-2).requires_grad_()
             offset = torch.tensor(bias).expand(2, -1).clone().to(DEVICE).requires_grad_()
             pair.append(network(draw(1, 32, 9, scale=0.5), draw(1, 32), draw(1, 32, 32), draw(1, 32), last, offset))
@@ -104,10 +107,13 @@ def networks(kind, seed: int = 0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [ObjectiveElastic, BoundedElastic])
-def test_networks_inside_the_kernels_are_those_outside(kind):
-    twins = run(simulator("separate", WALLS["separate"], torch.float32), networks(kind), check=False)
-    assert_agree(run(simulator("fused", WALLS["separate"], torch.float32), networks(kind), check=False), twins, torch.float32)
+@pytest.mark.parametrize(
+    ("kind", "plastic"), [(ObjectiveElastic, ObjectivePlastic), (BoundedElastic, ObjectivePlastic), (BoundedElastic, FullPlastic)]
+)
+def test_networks_inside_the_kernels_are_those_outside(kind, plastic):
+    laws = networks(kind, plastic)
+    twins = run(simulator("separate", WALLS["separate"], torch.float32), laws, check=False)
+    assert_agree(run(simulator("fused", WALLS["separate"], torch.float32), laws, check=False), twins, torch.float32)
 
 
 def test_segments_and_frames_alone():

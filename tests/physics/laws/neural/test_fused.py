@@ -5,7 +5,7 @@ import torch
 
 from neuido.physics.laws.base import Engine
 from neuido.physics.laws.neural import fused
-from neuido.physics.laws.neural.bounded import BoundedElastic
+from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.fused import FusedEngine
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
 from neuido.physics.mpm.simulator import Simulator
@@ -14,7 +14,12 @@ from tests.physics.bodies import block
 
 pytestmark = pytest.mark.gpu
 
-KINDS = {ObjectiveElastic: [0.5, 1.0, 0.1, -0.1], ObjectivePlastic: [2.0, 0.3, 1.0], BoundedElastic: [0.1, 0.3, 0.5, -0.4]}
+KINDS = {
+    ObjectiveElastic: [0.5, 1.0, 0.1, -0.1],
+    ObjectivePlastic: [2.0, 0.3, 1.0],
+    BoundedElastic: [0.1, 0.3, 0.5, -0.4],
+    FullPlastic: [2.0, 0.3, 0.4, 0.6],
+}
 
 
 def network(kind, width, scenes, shared, device="cuda"):
@@ -62,16 +67,18 @@ def test_fused_engine_equals_the_laws_own(width, kind, scenes, shared, wanted, m
             assert float((a - b).norm()) <= 2e-5 * float(a.norm()), f"result {n}: {float((a - b).norm() / a.norm()):.1e}"
 
 
-@pytest.mark.parametrize("kind", [ObjectiveElastic, BoundedElastic])
-def test_captured_rollout_equals_the_eager_one_and_its_gradient(kind):
+@pytest.mark.parametrize(
+    ("kind", "plasticity"), [(ObjectiveElastic, ObjectivePlastic), (BoundedElastic, ObjectivePlastic), (BoundedElastic, FullPlastic)]
+)
+def test_captured_rollout_equals_the_eager_one_and_its_gradient(kind, plasticity):
     body = block((0.3, 0.05, 0.3), (0.7, 0.45, 0.7), (12, 12, 12), velocity=(0.0, -2.0, 0.5))
     scene = Scene(cells=16, dt=5e-4, walls=Walls("separate", 0.3))
     results = []
     for graphs in (False, True):
         sim = Simulator([scene] * 2, [body] * 2, device="cuda", graphs=graphs, store="all" if graphs else "state")
-        elastic, plastic = network(kind, 64, 2, 1), network(ObjectivePlastic, 64, 2, 1)
+        elastic, plastic = network(kind, 64, 2, 1), network(plasticity, 64, 2, 1)
         leaves = [t.requires_grad_() for t in (*elastic, *plastic)]
-        laws = kind(*elastic), ObjectivePlastic(*plastic)
+        laws = kind(*elastic), plasticity(*plastic)
         if not graphs:
             for law in laws:
                 law.engine = lambda tensors, particles, law=law: Engine(law, tensors, particles)
