@@ -22,6 +22,10 @@ def film(
     flow_preset: str = "medium",
     samples: int = 256,
     seed: int = 0,
+    rates: list[float] | None = None,
+    shapes: str = "seen",
+    published: bool = False,
+    held_out: float = 0.0,
     device: str = "auto",
     batch: int = 0,
     shard: int = 0,
@@ -53,6 +57,11 @@ def film(
         flow_preset: Preset of the DIS optical flow: ultrafast, fast or medium.
         samples: Number of samples of the law of a clip.
         seed: Seed; a clip depends on the seed and its number only.
+        rates: Smallest and largest frame rate to draw from, 1/s, in place of frame_steps; a substep is then at most the largest of dts.
+            Absent: frame_steps substeps from frame to frame.
+        shapes: Group of shapes of the bodies: seen, held-out or unseen; no two groups share a shape.
+        published: Use the ten bodies of the literature too; their particles lie in NEUIDO_DATA.
+        held_out: Fraction of the clips, the last ones, whose bodies have the shapes held-out while the others' are seen.
         device: auto, cpu or cuda.
         batch: Clips simulated in one launch; 0: 1 on the CPU and 16 on a GPU.
         shard: Number of the shard to film, from 0; shards may be filmed at the same time into one folder.
@@ -83,6 +92,10 @@ def film(
         flow_preset=flow_preset,
         samples=samples,
         seed=seed,
+        rates=None if rates is None else tuple(rates),  # type: ignore[arg-type]
+        shapes=shapes,
+        published=published,
+        held_out=held_out,
     )
     if engine is None:
         generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)

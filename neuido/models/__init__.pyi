@@ -20,11 +20,13 @@ from .scoring.lpips import LPIPS
 from .scoring.metrics import ChamferDistance, MatchedRMSE, MedianRelativeError, chamfer_distance
 from .stages.adapt import AdaptModule
 from .stages.align import AlignModule
+from .stages.made_scenes import MadeSceneDataModule
 from .stages.pretrain import PretrainModule
 from .stages.pretrain_vae import FlowVAEModule
 from .stages.warmup import WarmupModule
 from .video.encoder import DynamicsEncoder, Encoder
 from .video.flow_vae import FlowVAE
+from .video.reader import Reading, Readings
 
 __all__ = [
     "LPIPS",
@@ -38,6 +40,7 @@ __all__ = [
     "IntrinsicDynamicsOperator",
     "KnownLaw",
     "LowRankAdaptation",
+    "MadeSceneDataModule",
     "MatchedRMSE",
     "MeanLatent",
     "MedianRelativeError",
@@ -49,6 +52,8 @@ __all__ = [
     "PreparedScene",
     "PretrainModule",
     "RandomLatent",
+    "Reading",
+    "Readings",
     "ReconstructModule",
     "SparseLaw",
     "Splatting",

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 MODULES = (  # so that their class names resolve without a path
-    *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt")),
+    *(f"neuido.models.stages.{name}" for name in ("pretrain", "pretrain_vae", "warmup", "align", "adapt", "made_scenes")),
     *(f"neuido.models.baselines.{name}" for name in ("known_law", "nclaw", "spring_gaus", "sparse_law", "stage_one_latents")),
     "neuido.models.fewshot.low_rank",
     "neuido.data.trajectories.trajectory_module",

@@ -38,7 +38,7 @@ from neuido.data.measured.experiment import read_experiment, scene_to_dict
 from neuido.data.scenes.multiview import UP, SceneViews
 from neuido.data.scenes.readers import read_recording
 from neuido.errors import UserError
-from neuido.types import Body, MultiViewBatch, Scene, Vector
+from neuido.types import Body, Gaussians, MultiViewBatch, Scene, Vector
 
 FORMAT, MOTION = "neuido-visual/1", "neuido-motion/1"
 RECONSTRUCTION = "reconstruction"
@@ -102,8 +102,9 @@ class VisualScene(NamedTuple):
     """Declared material: density, elasticity and plasticity; not the true material."""
     body: Body
     """Particles at t = 0, with the initial velocity if it is known."""
-    gaussians: Path | None
-    """Path of the reconstructed first frame, a 3DGS PLY file in simulation coordinates; None: the particles are rendered."""
+    gaussians: Path | Gaussians | None
+    """Path of the reconstructed first frame, a 3DGS PLY file in simulation coordinates; or one Gaussian for each particle; None: the
+    particles are rendered."""
     batch: MultiViewBatch
     """Images of all views and frames, and cameras in simulation coordinates; `held_out` marks the held-out views."""
     truth: Truth | None

@@ -108,6 +108,7 @@ def prepare(
     device: str | torch.device = "auto",
     encoder_views: int = 0,
     cache: str | os.PathLike | None = None,
+    graphs: bool = True,
 ) -> PreparedScene:
     """Prepare a scene on a device: bind its Gaussians to the particles and embed its flow.
 
@@ -117,6 +118,7 @@ def prepare(
         device: `auto` (CUDA where available), `cpu`, `cuda`, or a torch device.
         encoder_views: Number of training views for the encoder, starting with the first; 0: all.
         cache: Folder for cached optical flow.
+        graphs: As of `Simulator`; the graphs of hundreds of scenes take more memory than a GPU has.
 
     Raises:
         UserError: Two frames have the same time, there is no training view, or as in `Simulator` and `DynamicsEncoder.measure_flow`.
@@ -134,10 +136,12 @@ def prepare(
         with torch.no_grad():
             velocities = encoder.measure_flow(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
             volume, conditions = (t.to(device) for t in encoder.embed(velocities))
-    simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device)
+    simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device, graphs=graphs)
     if scene.gaussians is None:
         rest = simulator.volume / torch.linalg.det(simulator.state.F)  # a body may start deformed
         gaussians, binding = attach_gaussians(simulator.state.x, rest), None
+    elif isinstance(scene.gaussians, Gaussians):
+        gaussians, binding = Gaussians(*(None if t is None else t.to(device) for t in scene.gaussians)), None
     else:
         gaussians = load_gaussians(scene.gaussians, device=device)
         binding = bind(gaussians, simulator.state.x)

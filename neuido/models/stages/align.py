@@ -30,6 +30,9 @@ from neuido.models.stages.image_module import (
 )
 from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
 
+GRAPHED = 24
+"""Number of scenes up to which rollouts are captured as CUDA graphs, which keep up to a gigabyte for each scene."""
+
 
 class AlignModule(ImageModule):
     """Train and score Stage II, and predict zero-shot. Trunks, heads and VAE are frozen; each step uses the next scene.
@@ -125,9 +128,13 @@ class AlignModule(ImageModule):
     def prepared(self, scene: VisualScene) -> PreparedScene:
         """Return the prepared scene, from the cache after the first call."""
         if scene.name not in self._prepared:
-            options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache}
+            options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache, "graphs": self._few_scenes()}
             self._prepared[scene.name] = prepare(scene, self.encoder, device=self.device, **options)
         return self._prepared[scene.name]
+
+    def _few_scenes(self) -> bool:
+        """Return whether the CUDA graphs of all scenes fit into the memory beside each other."""
+        return self._trainer is None or len(self.trainer.datamodule.scenes) <= GRAPHED
 
     # Fitting.
 

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,9 +27,20 @@ from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
 from neuido.models.video.flow import PRESETS, measure_velocities
+from neuido.models.video.random_bodies import GROUPS, frame_steps, launch, random_body
 from neuido.physics.mpm.simulator import COURANT_LIMIT, Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
+
+DENSITY = 1000.0
+"""Density of the bodies [kg/m^3]."""
+try:  # until the families have rates
+    from neuido.data.bodies.families import effects
+except ImportError:
+
+    def effects(family, parameters):
+        return None
+
 
 FLOORS = (0.0, 0.5, math.inf)
 """Friction coefficients of the floor, one of which is sampled for each clip."""
@@ -51,6 +63,10 @@ class ClipPlan:
     flow_preset: str
     samples: int
     seed: int
+    rates: tuple[float, float] | None = None
+    shapes: str = "seen"
+    published: bool = False
+    held_out: float = 0.0
 
     def __post_init__(self) -> None:
         for name, least in (("count", 1), ("views", 1), ("frames", 5), ("frame_steps", 1), ("cells", 4), ("particles", 8), ("samples", 1)):
@@ -60,10 +76,28 @@ class ClipPlan:
             raise UserError(f"flow_size = {self.flow_size} must be a multiple of 8 from 16 to width = {self.width}")
         if not self.dts or not all(dt > 0 for dt in self.dts) or self.flow_preset not in PRESETS:
             raise UserError(f"dts = {list(self.dts)} must be positive, and flow_preset = {self.flow_preset!r} one of {', '.join(PRESETS)}")
+        if self.rates is not None and not (len(self.rates) == 2 and 0 < self.rates[0] <= self.rates[1] < math.inf):
+            raise UserError(f"rates = {list(self.rates)} must be the smallest and the largest frame rate in 1/s, such as [24, 400]")
+        if self.shapes not in GROUPS or not 0 <= self.held_out < 1:
+            raise UserError(
+                f"shapes = {self.shapes!r} must be one of {', '.join(GROUPS)}, and held_out = {self.held_out} from 0 to below 1"
+            )
         if not self.families:
             raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
             check_ranges(family, ranges)
+
+    def family_of(self, number: int) -> str:
+        """Return the family of a clip; the families alternate."""
+        return list(self.families)[number % len(self.families)]
+
+    def shapes_of(self, number: int) -> str:
+        """Return the group of shapes of a clip: the last ones have shapes that no other clip of the plan has."""
+        return "held-out" if self.shapes == "seen" and number >= self.count - round(self.held_out * self.count) else self.shapes
+
+    def body_options(self, number: int) -> tuple[int, str, bool]:
+        """Return particles, group of shapes and whether published bodies are drawn, for `random_body`."""
+        return self.particles, self.shapes_of(number), self.published
 
 
 HALVINGS = 2
@@ -76,6 +110,10 @@ class ClipSetup(NamedTuple):
     name: str
     family: str
     parameters: dict[str, float]
+    shape: str
+    """Name of the body's shape."""
+    frame_steps: int
+    """Substeps between frames."""
     scene: Scene
     body: Body
     gaussians: Gaussians
@@ -103,159 +141,164 @@ def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: i
     def whole(name: str) -> bool:
         return is_complete(folder / f"{name}.npz") and is_as_written(folder / f"{name}.npz", unnoted=published)
 
-    missing = [i for i in own if not whole(names[i])]
-    size = batch or (16 if chosen.type == "cuda" else 1)
-    kinds, workers = list(plan.families), max(1, (os.cpu_count() or 1) // shards)
+    def left_out(name: str) -> bool:
+        return (folder / f"{name}.json").is_file()
+
+    missing = [i for i in own if not left_out(names[i]) and not whole(names[i])]
+    size, workers = batch or (16 if chosen.type == "cuda" else 1), max(1, (os.cpu_count() or 1) // shards)
     with Progress("clips", len(own), done=len(own) - len(missing), shown=progress) as work:
-        for k in range(len(kinds)):
-            wanted = [i for i in missing if i % len(kinds) == k]
-            for start in range(0, len(wanted), size):
-                with ThreadPoolExecutor(workers if size > 1 else 1) as pool:
-                    group = list(pool.map(lambda i: sample_clip(plan, i), wanted[start : start + size]))
-                    filmed = film_clips(plan, group, chosen, note=work.print)
-                    list(pool.map(lambda pair: _write_clip(plan, folder, *pair), zip(group, filmed)))
-                work.update(len(group))
-    if (missing or not (folder / "index.json").exists()) and all(whole(name) for name in names):
-        entries = []
-        for i, name in enumerate(names):
-            family, parameters = _material(plan, np.random.default_rng([plan.seed, i]), i)
-            digest = sha256_of(folder / f"{name}.npz")
-            entries.append({"name": name, "family": family, "parameters": parameters, "sha256": digest})
+        for wanted in _launches(plan, missing, size):
+            with ThreadPoolExecutor(workers if size > 1 else 1) as pool:
+                group = list(pool.map(lambda i: sample_clip(plan, i), wanted))
+                filmed = film_clips(plan, group, chosen, note=work.print)
+                for written in [pool.submit(_write_clip, plan, folder, clip, seen) for clip, seen in zip(group, filmed)]:
+                    written.result()
+            work.update(len(group))
+    if (missing or not (folder / "index.json").exists()) and all(left_out(name) or whole(name) for name in names):
+        entries = [_entry(plan, folder, i) for i, name in enumerate(names) if not left_out(name)]
         write_json(folder / "index.json", {"format": FORMAT, "plan": asdict(plan), "clips": entries})
 
 
-def sample_clip(plan: ClipPlan, number: int) -> ClipSetup:
-    """Sample the set-up of the clip of a given number: material, floor, body, texture and cameras."""
-    random = np.random.default_rng([plan.seed, number])
-    family, parameters = _material(plan, random, number)
+def _launches(plan: ClipPlan, numbers: list[int], size: int) -> list[list[int]]:
+    """Return the numbers of clips in lists for one launch each, in a random order: a part of them has all families."""
+    lists = [wanted[start : start + size] for wanted in alike(plan, numbers) for start in range(0, len(wanted), size)]
+    return [lists[k] for k in np.random.default_rng(plan.seed).permutation(len(lists))]
+
+
+def alike(plan: ClipPlan, numbers: list[int]) -> list[list[int]]:
+    """Return the numbers of clips in lists of one family and one number of substeps between frames, which share a launch."""
+    lists: dict[tuple[str, int], list[int]] = {}
+    for i in numbers:
+        lists.setdefault((plan.family_of(i), steps_of(plan, i)), []).append(i)
+    return list(lists.values())
+
+
+def steps_of(plan: ClipPlan, number: int) -> int:
+    """Return the number of substeps between the frames of a clip."""
+    return _timing(plan, number, *_material(plan, number))[1]
+
+
+def _entry(plan: ClipPlan, folder: Path, number: int) -> dict[str, Any]:
+    """Return what index.json says of a clip."""
+    name = f"clip-{number:05d}"
+    family, parameters = _material(plan, number)
+    shape = random_body(_source(plan, number, "body"), *plan.body_options(number))[0]
+    digest = sha256_of(folder / f"{name}.npz")
+    return {"name": name, "family": family, "parameters": parameters, "shape": shape, "sha256": digest}
+
+
+def _source(plan: ClipPlan, number: int, what: str) -> np.random.Generator:
+    """Return the source of randomness of a part of a clip."""
+    return np.random.default_rng([plan.seed, number, ("material", "timing", "body", "film").index(what)])
+
+
+def _timing(plan: ClipPlan, number: int, family: str, parameters: dict[str, float]) -> tuple[float, int]:
+    """Return the substep [s] and the number of substeps between the frames of a clip."""
+    random = _source(plan, number, "timing")
+    speed = math.sqrt(float(laws(family, [parameters])[0].modulus()) / DENSITY)
+    limit = 0.9 * COURANT_LIMIT / plan.cells / max(speed, 1e-9)
+    if plan.rates is not None:
+        return frame_steps(plan.rates, min(limit, max(plan.dts)), random)
     dt = float(random.choice(plan.dts))
-    modulus = float(laws(family, [parameters])[0].modulus())
-    if dt * math.sqrt(modulus / 1000.0) > 0.9 * COURANT_LIMIT / plan.cells:
-        dt = min(plan.dts)
+    return (min(plan.dts) if dt > limit else dt), plan.frame_steps
+
+
+def sample_clip(plan: ClipPlan, number: int, *, fill: int = 0) -> ClipSetup:
+    """Sample the set-up of the clip of a given number: material, frame rate, floor, body, launch, texture and cameras.
+
+    Args:
+        plan: The plan.
+        number: Number of the clip.
+        fill: Number of the filling of the body: 0 is the one that is filmed, another is the same body with other particles.
+    """
+    family, parameters = _material(plan, number)
+    dt, steps = _timing(plan, number, family, parameters)
+    shape, points, volume = random_body(_source(plan, number, "body"), *plan.body_options(number))
+    random = _source(plan, number, "film")
     scene = Scene(cells=plan.cells, dt=dt, walls=Walls(friction=float(random.choice(FLOORS))))
-    x, volume = _shape(random, plan.particles)
-    height = random.uniform(0.01, 0.06)
-    # the horizontal offset is small enough for the walls
-    x = x + np.array([0.5 + random.uniform(-0.05, 0.05), height - x[:, 1].min(), 0.5 + random.uniform(-0.05, 0.05)])
-    x = torch.from_numpy(x)
-    centre = tuple(x.mean(0).tolist())
-    velocity = (random.uniform(-0.5, 0.5), random.uniform(-3.0, -0.5), random.uniform(-0.5, 0.5))
-    v = rigid_velocity(x, centre=centre, velocity=velocity, angular_velocity=tuple(random.uniform(-3, 3, 3).tolist()))
+    lift, velocity, spin = launch(random, points, dt * steps * (plan.frames - 1))
+    centre = tuple((points.mean(0) + lift).tolist())
+    if fill:
+        _, points, volume = random_body(_source(plan, number, "body"), *plan.body_options(number), fill=fill)
+    x = torch.from_numpy(points + lift)
+    v = rigid_velocity(x, centre=centre, velocity=velocity, angular_velocity=spin)  # type: ignore[arg-type]
     body = Body(x.float(), v.float(), torch.full((len(x),), volume / len(x)))
-    return ClipSetup(
-        f"clip-{number:05d}",
-        family,
-        parameters,
-        scene,
-        body,
-        _textured_gaussians(random, body, volume),
-        _cameras(random, plan, (0.5, 0.35, 0.5)),
-    )
+    gaussians, cameras = _textured_gaussians(random, body, volume), _cameras(random, plan, (0.5, 0.35, 0.5))
+    return ClipSetup(f"clip-{number:05d}", family, parameters, shape, steps, scene, body, gaussians, cameras)
 
 
 def film_clips(
     plan: ClipPlan, group: list[ClipSetup], device: torch.device, *, note: Callable[[str], Any] = lambda line: None
-) -> Iterator[dict[str, Tensor]]:
-    """Simulate and render clips of one family; yield images, masks and samples of the law of each, on the CPU.
+) -> Iterator[dict[str, Tensor] | None]:
+    """Simulate and render clips of one family and one number of substeps between frames.
 
-    `note` is called with a line for each event that makes a motion doubtful.
+    Yields images, masks and samples of the law of each, on the CPU; None for a clip that no time step makes stable. `note` is called with a
+    line for each event that makes a motion doubtful.
     """
-    for clip, motion in zip(group, _simulate(plan, group, device, note), strict=True):
-        gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
-        cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
-        with torch.no_grad():
-            images, alphas = render(deform(gaussians, motion.F, motion.x), cameras, background=torch.ones(3, device=device))
-        seen = {"images": images.transpose(0, 1).cpu(), "masks": alphas.transpose(0, 1).cpu()}
-        yield seen | _samples(motion, clip, plan.samples, int(clip.name.removeprefix("clip-")))
+    for clip, motion in zip(group, simulate_clips(group, plan.frames, device, note), strict=True):
+        yield None if motion is None else {**render_clip(clip, motion, device), **_samples(motion, clip, plan.samples)}
 
 
-def _simulate(
-    plan: ClipPlan, group: list[ClipSetup], device: torch.device, note: Callable[[str], Any], halvings: int = 0
-) -> list[ParticleState]:
-    """Simulate the clips together; an unstable clip is repeated alone with half and a quarter of the time step."""
+def render_clip(clip: ClipSetup, motion: ParticleState, device: torch.device) -> dict[str, Tensor]:
+    """Render the motion of a clip: images (V, T, H, W, 3) and masks (V, T, H, W), on the CPU."""
+    gaussians = Gaussians(*(None if t is None else t.to(device) for t in clip.gaussians))
+    cameras = clip.cameras._replace(viewmats=clip.cameras.viewmats.to(device), Ks=clip.cameras.Ks.to(device))
+    with torch.no_grad():
+        images, alphas = render(deform(gaussians, motion.F, motion.x), cameras, background=torch.ones(3, device=device))
+    return {"images": images.transpose(0, 1).cpu(), "masks": alphas.transpose(0, 1).cpu()}
+
+
+def simulate_clips(
+    group: list[ClipSetup], frames: int, device: torch.device, note: Callable[[str], Any] = lambda line: None, halvings: int = 0
+) -> list[ParticleState | None]:
+    """Simulate clips together; an unstable clip is repeated alone with half and a quarter of the time step, and is None at last."""
     share = 2**halvings
     scenes = [replace(c.scene, dt=c.scene.dt / share) for c in group]
+    family, parameters, every = group[0].family, [c.parameters for c in group], group[0].frame_steps * share
     try:
-        simulator = Simulator(scenes, [c.body for c in group], device=device, graphs=False)
-        pair = laws(group[0].family, [c.parameters for c in group])
-        every = plan.frame_steps * share
+        simulator = Simulator(scenes, [c.body for c in group], density=DENSITY, device=device, graphs=False)
         with torch.no_grad():
-            frames = simulator.rollout(every * (plan.frames - 1), *pair, every=every)
+            found = simulator.rollout(every * (frames - 1), *laws(family, parameters), effects=effects(family, parameters), every=every)
     except UserError as error:
         if len(group) > 1:
             middle = len(group) // 2
-            return [part for half in (group[:middle], group[middle:]) for part in _simulate(plan, half, device, note, halvings)]
+            return [part for half in (group[:middle], group[middle:]) for part in simulate_clips(half, frames, device, note, halvings)]
         if halvings == HALVINGS:
-            raise UserError(f"{group[0].name}: {error}") from error
-        return _simulate(plan, group, device, note, halvings + 1)
-    for event in frames.events:
+            note(f"note: {group[0].name} is left out: {error}")
+            return [None]
+        return simulate_clips(group, frames, device, note, halvings + 1)
+    for event in found.events:
         own = event._replace(first=event.first - simulator.particles.offsets[event.scene])
         note(f"note: {group[event.scene].name}: {own.words}")
-    parts = zip(simulator.particles.offsets[:-1], simulator.particles.offsets[1:])
-    return [ParticleState(*(part[:, a:b] for part in frames)) for a, b in parts]
+    return [ParticleState(*(part[:, a:b] for part in found)) for a, b in pairwise(simulator.particles.offsets)]
 
 
-def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str, Tensor]) -> None:
-    """Measure the optical flow of a clip and write its file."""
-    times = torch.arange(plan.frames) * clip.scene.dt * plan.frame_steps
-    options = {"size": plan.flow_size, "preset": plan.flow_preset}
+def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str, Tensor] | None) -> None:
+    """Measure the optical flow of a clip and write its file; of a clip that is left out, a file that says so."""
+    if filmed is None:
+        write_json(folder / f"{clip.name}.json", {"left_out": "no time step makes it stable", "parameters": clip.parameters})
+        return
+    times = torch.arange(plan.frames) * clip.scene.dt * clip.frame_steps
+    options = {"size": plan.flow_size, "preset": plan.flow_preset, "threads": 1}
     seen = measure_velocities(filmed.pop("images"), filmed.pop("masks"), times, clip.cameras, clip.body.x.mean(0), **options)
     content = {"flow": seen.flow.half(), "cell": seen.cell, "frame_interval": torch.tensor(seen.frame_interval), **filmed}
     write_arrays(folder / f"{clip.name}.npz", {name: t.numpy() for name, t in content.items()}, compressed=False, digest=True)
 
 
-def _samples(motion: ParticleState, clip: ClipSetup, count: int, seed: int) -> dict[str, Tensor]:
+def _samples(motion: ParticleState, clip: ClipSetup, count: int) -> dict[str, Tensor]:
     """Sample the law at deformations of the motion: trial and corrected F, and stress, (n, 3, 3) each."""
     elastic, plastic = laws(clip.family, [clip.parameters])
     F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
-    pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(seed)).to(F.device)
+    number = int(clip.name.removeprefix("clip-"))
+    pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(number)).to(F.device)
     trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float()
     corrected = evaluate(plastic, trial)
     return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": evaluate(elastic, corrected).cpu()}
 
 
-def _material(plan: ClipPlan, random: np.random.Generator, number: int) -> tuple[str, dict[str, float]]:
-    family = list(plan.families)[number % len(plan.families)]
-    return family, draw_parameters(family, plan.families[family], random)
-
-
-def _shape(random: np.random.Generator, particles: int) -> tuple[np.ndarray, float]:
-    """Sample the points (P, 3) and the volume [m^3] of a randomly rotated ball, box, cylinder or union of ellipsoids about the origin.
-
-    Half of the bodies are unions: three thick ellipsoids, or a trunk with four thin limbs, which bend long before the trunk yields.
-    """
-    kind = random.choice(["ball", "box", "cylinder", "blob", "limbs", "limbs"])
-    half = random.uniform(0.09, 0.24, 3)
-    points = random.uniform(-1, 1, (max(20_000, 25 * particles), 3))
-    if kind == "ball":
-        half, inside = np.full(3, half[0]), (points**2).sum(1) < 1
-    elif kind == "box":
-        inside = np.ones(len(points), dtype=bool)
-    elif kind == "cylinder":
-        inside = points[:, 0] ** 2 + points[:, 2] ** 2 < 1
-    elif kind == "limbs":
-        half = random.uniform(0.17, 0.3, 3)
-        inside = (((points / random.uniform(0.3, 0.6, 3)) ** 2).sum(1) < 1) | _limbs(random, points)
-    else:
-        centres, radii = random.uniform(-0.45, 0.45, (3, 3)), random.uniform(0.35, 0.55, (3, 1, 3))
-        inside = ((((points - centres[:, None]) / radii) ** 2).sum(2) < 1).any(0)
-    volume = float(8 * half.prod() * inside.mean())
-    filled = points[inside] * half
-    # one point per cell of a jittered grid: even, without the rows of a lattice
-    spacing = (volume / particles) ** (1 / 3)
-    place = np.floor(filled / spacing).astype(np.int64) + 10_000
-    cell = np.unique(place @ np.array([10**10, 10**5, 1]), return_index=True)[1]
-    turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
-    return filled[cell] @ turn, volume
-
-
-def _limbs(random: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Return a mask of the points in one of four capsules that start at the origin."""
-    tips = random.standard_normal((4, 3))
-    tips *= random.uniform(0.5, 0.95, (4, 1)) / np.linalg.norm(tips, axis=1, keepdims=True)
-    along = np.clip(points @ tips.T / (tips**2).sum(1), 0, 1)
-    distance = np.linalg.norm(points[:, None] - along[..., None] * tips, axis=2)
-    return (distance < random.uniform(0.12, 0.3, 4)).any(1)
+def _material(plan: ClipPlan, number: int) -> tuple[str, dict[str, float]]:
+    family = plan.family_of(number)
+    return family, draw_parameters(family, plan.families[family], _source(plan, number, "material"))
 
 
 def _textured_gaussians(random: np.random.Generator, body: Body, volume: float) -> Gaussians:

@@ -1,10 +1,10 @@
 """The dynamics encoder: from a video to the latent z of its material (paper, "Model Architecture Details", branch network).
 
 The frozen 3D VAE (`video_vae.py`) encodes flow videos as a volume of latents. The projector (a 3D convolution, an MLP, attention pooling
-and a final MLP) maps the volume to z; only the projector is trained. Views are encoded separately, and their z are averaged.
+and a final MLP) maps the volume to z. Views are encoded separately, and their z are averaged. An encoder of the warm-up over all families
+has a reader too (`reader.py`; not in the paper), which predicts a distribution of family and material properties from the same volume.
 """
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from datetime import date
@@ -13,14 +13,15 @@ from typing import Any, Literal, Protocol, Self
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from neuido.data.files.parsing import naming
 from neuido.data.files.values import mapping
 from neuido.data.weight_files import build
 from neuido.errors import UserError
 from neuido.models.video.flow import ENCODINGS, Velocities, encode_flow, measure_velocities
-from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, FlowVAE, read_weights, write_weights
+from neuido.models.video.flow_vae import CHANNELS, ENCODER_FORMAT, ENCODER_FORMATS, FlowVAE, read_weights, write_weights
+from neuido.models.video.pooling import AttentionPool, positions
+from neuido.models.video.reader import Reader, Readings
 from neuido.models.video.video_vae import PREFIX, CogVideoXVAE, open_vae
 from neuido.types import MultiViewBatch
 
@@ -43,21 +44,6 @@ class ReadsLatents(Protocol):
     def fingerprint(self) -> str:
         """Identify the operator's weights."""
         ...
-
-
-class AttentionPool(nn.Module):
-    """Attention pooling of tokens, (B, N, width) -> (B, width), with one learned query for each head."""
-
-    def __init__(self, width: int, heads: int):
-        super().__init__()
-        self.heads = heads
-        self.query = nn.Parameter(torch.randn(1, 1, width) / width**0.5)
-        self.key, self.value, self.out = nn.Linear(width, width), nn.Linear(width, width), nn.Linear(width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        q, k, v = (t.unflatten(-1, (self.heads, -1)).transpose(1, 2) for t in (self.query, self.key(tokens), self.value(tokens)))
-        pooled = functional.scaled_dot_product_attention(q.expand(len(tokens), -1, -1, -1), k, v)
-        return self.out(pooled.transpose(1, 2).flatten(1))
 
 
 class Projector(nn.Module):
@@ -101,7 +87,7 @@ class Projector(nn.Module):
     def forward(self, volume: Tensor, conditions: Tensor) -> Tensor:
         """Return z of each view (V, d) from flow latents (V, channels, T', h, w) and conditions (V, 2) of `scale_conditions`."""
         x = self.conv(volume)
-        x = (x + _positions(x)).flatten(2).transpose(1, 2)
+        x = (x + positions(x)).flatten(2).transpose(1, 2)
         x = x + self.tokens(x)
         if self.clock is not None:
             x = x + self.clock(conditions)[:, None]
@@ -121,22 +107,6 @@ class Projector(nn.Module):
         mix = torch.randn(len(latents), last.in_features, dtype=latents.dtype) / last.in_features**0.5
         last.weight.copy_(spread * centred.T @ mix / max(1, len(latents) - 1) ** 0.5)
         last.bias.copy_(latents.mean(0))
-
-
-def _positions(x: Tensor) -> Tensor:
-    """Return sinusoidal position encodings (1, C, T, H, W): space relative to the image, time in latent frames."""
-    _, channels, T, H, W = x.shape
-    axes = (torch.arange(T) / 8.0, (torch.arange(H) + 0.5) / H, (torch.arange(W) + 0.5) / W)
-    share = channels // 6
-    frequency = math.pi * 2.0 ** torch.linspace(0, 2, share)
-    parts = []
-    for a, axis in enumerate(axes):
-        angle = frequency[:, None] * axis
-        wave = torch.cat([angle.sin(), angle.cos()])
-        shape = [1, 2 * share, 1, 1, 1]
-        shape[2 + a] = len(axis)
-        parts.append(wave.view(shape).expand(1, 2 * share, T, H, W))
-    return torch.cat(parts, 1).to(x)
 
 
 def scale_conditions(frame_interval: Tensor | float, cell: Tensor) -> Tensor:
@@ -163,6 +133,7 @@ class DynamicsEncoder(nn.Module):
         width, heads, conditions, dropout: Options of the `Projector`.
 
     Attributes:
+        reader: Network that predicts family and properties of the material with their uncertainty; None in encoders without one.
         card: Information on the training from the weights file.
     """
 
@@ -189,6 +160,7 @@ class DynamicsEncoder(nn.Module):
         self.vae = opened.eval().requires_grad_(False)
         self.flow = {"flow_size": flow_size, "flow_encoding": flow_encoding, "speed_scale": speed_scale, "flow_preset": flow_preset}
         self.projector = Projector(opened.channels, latent_dim, width, heads, conditions, dropout)
+        self.reader: Reader | None = None
         self.card: dict[str, Any] = {}
 
     def __repr__(self) -> str:
@@ -226,11 +198,23 @@ class DynamicsEncoder(nn.Module):
     @torch.no_grad()
     def embed(self, seen: Velocities) -> tuple[Tensor, Tensor]:
         """Return flow latents (V, channels, T', S/8, S/8) and conditions (V, 2), which stay constant while the projector is trained."""
+        return self.embed_flow(seen.flow, seen.frame_interval, seen.cell)
+
+    @torch.no_grad()
+    def embed_flow(self, flow: Tensor, interval: Tensor | float, cell: Tensor, *, batch: int = 1) -> tuple[Tensor, Tensor]:
+        """Return flow latents and conditions as `embed`, of N videos that may be of several scenes.
+
+        Args:
+            flow: Velocities [m/s], (N, T - 1, S, S, 2).
+            interval: Frame interval [s], a number or (N,).
+            cell: Side of a flow cell [m], (N,).
+            batch: Videos that the VAE encodes at a time.
+        """
         like = next(self.projector.parameters())
-        flow, cell = seen.flow.to(like.device, torch.float32), seen.cell.to(like.device)
         options = {"encoding": self.flow["flow_encoding"], "speed_scale": self.flow["speed_scale"]}
-        volume = torch.cat([self.vae.encode(encode_flow(each[None], **options)) for each in flow])
-        return volume.to(like), scale_conditions(seen.frame_interval, cell).to(like)
+        parts = [encode_flow(part.to(like.device, torch.float32), **options) for part in flow.split(batch)]
+        volume = torch.cat([self.vae.encode(part) for part in parts])
+        return volume.to(like), scale_conditions(interval, cell.to(like.device)).to(like)
 
     def measure_flow(
         self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None
@@ -255,14 +239,29 @@ class DynamicsEncoder(nn.Module):
         """Return z (d,) from flow latents and conditions: the mean of the projector output over the views."""
         return self.projector(volume, conditions).mean(0)
 
+    @torch.no_grad()
+    def read(self, volume: Tensor, conditions: Tensor) -> Readings | None:
+        """Return what the reader says of the material, from flow latents and conditions of V views; None without a reader."""
+        if self.reader is None:
+            return None
+        was_training = self.reader.training
+        self.reader.eval()
+        found = self.reader.read(volume, conditions)
+        self.reader.train(was_training)
+        return found
+
     def save(self, path: str | os.PathLike, card: Mapping[str, Any] | None = None) -> None:
-        """Write the projector and the VAE (only the name for CogVideoX) to a safetensors file atomically."""
-        tensors = {f"projector.{name}": t.detach().contiguous().cpu() for name, t in self.projector.state_dict().items()}
+        """Write projector, reader and VAE (only the name for CogVideoX) to a safetensors file atomically."""
+        parts = {"projector": self.projector} | ({} if self.reader is None else {"reader": self.reader})
+        tensors = {
+            f"{part}.{name}": t.detach().contiguous().cpu() for part, module in parts.items() for name, t in module.state_dict().items()
+        }
         if isinstance(self.vae, FlowVAE):
             tensors |= {f"vae.{name}": t.detach().contiguous().cpu() for name, t in self.vae.state_dict().items()}
         config = {"flow": self.flow, "projector": self.projector.config, "source": self.source, "vae": getattr(self.vae, "config", None)}
         if self.source is not None:
             config["vae"] = None
+        config["reader"] = None if self.reader is None else self.reader.config
         write_weights(path, ENCODER_FORMAT, config, tensors, {"date": date.today().isoformat(), **(card or {})})
 
     @classmethod
@@ -284,14 +283,14 @@ class DynamicsEncoder(nn.Module):
             UserError: The file is missing, or it is not an encoder.
         """
         file = PRETRAINED.get(str(path)) or Path(path)
-        config, tensors, card = read_weights(file, (ENCODER_FORMAT,), "encoder")
+        config, tensors, card = read_weights(file, ENCODER_FORMATS, "encoder")
         source = config.get("source")
         if source is not None and not (isinstance(source, str) and source.startswith(PREFIX)):
             raise UserError(f"encoder: {file}: source must begin with {PREFIX}, got {source!r}")
         flow, projector = (mapping(config.get(key), f"encoder: {file}: {key}") for key in ("flow", "projector"))
         own = {
             part: {name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")}
-            for part in ("projector", "vae")
+            for part in ("projector", "vae", "reader")
         }
         vae = source or build(FlowVAE, mapping(config.get("vae"), f"encoder: {file}: vae"), own["vae"], file)
         fitted = build(Projector, projector, own["projector"], file)
@@ -301,6 +300,12 @@ class DynamicsEncoder(nn.Module):
         if encoder.projector.config != fitted.config:
             raise UserError(f"encoder: {file}: its projector takes {fitted.config['channels']} channels, its VAE {encoder.vae.channels}")
         encoder.projector, encoder.card = fitted, card
+        if config.get("reader") is not None:
+            encoder.reader = build(Reader, mapping(config["reader"], f"encoder: {file}: reader"), own["reader"], file)
+            if encoder.reader.config["channels"] != encoder.vae.channels:
+                raise UserError(
+                    f"encoder: {file}: its reader takes {encoder.reader.config['channels']} channels, not {encoder.vae.channels}"
+                )
         return encoder
 
 

@@ -123,6 +123,7 @@ def measure_velocities(
     size: int = 64,
     preset: str = "medium",
     cache: str | os.PathLike | None = None,
+    threads: int | None = None,
 ) -> Velocities:
     """Measure the velocities in videos within a square around the body, masked by its silhouette.
 
@@ -135,6 +136,7 @@ def measure_velocities(
         size: Number of cells S along each side.
         preset: As in `optical_flow`.
         cache: Folder for cached flow, under a key of all inputs that affect it; no cache where absent.
+        threads: As in `optical_flow`.
 
     Raises:
         UserError: As in `optical_flow`, `pixel_length` and `frame_interval_of`.
@@ -149,7 +151,7 @@ def measure_velocities(
         path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
     found = _read_cache(path)
     if found is None:
-        found = _crop_flow(optical_flow(images, preset=preset), masks, size)
+        found = _crop_flow(optical_flow(images, preset=preset, threads=threads), masks, size)
         if path is not None:
             write_arrays(path, {"flow": found[0].numpy(), "side": found[1].numpy()}, compressed=False)
     flow, side = found

@@ -23,8 +23,10 @@ from neuido.data.weight_files import build, parse_metadata, read_safetensors
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
-ENCODER_FORMAT = "neuido-encoder/1"
-"""Format of `encoder.DynamicsEncoder`, whose files hold a VAE in addition to the projector."""
+ENCODER_FORMAT = "neuido-encoder/2"
+"""Format of `encoder.DynamicsEncoder`, whose files hold a VAE in addition to the projector, and a reader or none."""
+ENCODER_FORMATS = (ENCODER_FORMAT, "neuido-encoder/1")
+"""Formats of encoders that can be read; those of the first version have no reader."""
 CHANNELS = 16
 """Number of latent channels, as in CogVideoX."""
 
@@ -168,7 +170,7 @@ class FlowVAE(nn.Module):
         Raises:
             UserError: The file is missing or has another format.
         """
-        config, tensors, card = read_weights(path, (FORMAT, ENCODER_FORMAT), "vae")
+        config, tensors, card = read_weights(path, (FORMAT, *ENCODER_FORMATS), "vae")
         if "projector" in config:
             if config.get("vae") is None:
                 raise UserError(f"vae: {path} holds no VAE: its encoder uses {config.get('source')!r}")
