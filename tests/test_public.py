@@ -29,11 +29,12 @@ PUBLIC = {
         read_recording read_tracks scene_names shapes write_experiment
     """,
     "neuido.models": """
-        AdaptModule AlignModule ChamferDistance DynamicsEncoder Encoder FlowVAE FlowVAEModule IntrinsicDynamicsOperator KnownLaw
-        LPIPS LowRankAdaptation MadeSceneDataModule MatchedRMSE MeanLatent MedianRelativeError Method Moduli NCLaw NeuMA Operator PreparedScene
-        PretrainModule RandomLatent Reading Readings ReconstructModule SparseLaw Splatting SpringMass UniPhy VideoLaw WarmupModule attach_gaussians
-        bind chamfer_distance deform fill load_gaussians load_law load_nclaw opacity_volume prepare rasterize read_law relative_lp
-        render save_gaussians save_law small_strain_moduli visual_hull write_particles write_video
+        AdaptModule AlignModule ChamferDistance DynamicsEncoder Encoder FlowVAE FlowVAEModule
+        IntrinsicDynamicsOperator KnownLaw LPIPS LowRankAdaptation MadeSceneDataModule MatchedRMSE MeanLatent
+        MedianRelativeError Method Moduli NCLaw NeuMA Operator PreparedScene PretrainModule RandomLatent Reading
+        Readings ReconstructModule SparseLaw Splatting SpringMass UniPhy VideoLaw WarmupModule attach_gaussians bind
+        chamfer_distance deform fill load_gaussians load_law load_nclaw opacity_volume prepare rasterize read_law
+        relative_lp render save_gaussians save_law small_strain_moduli visual_hull write_particles write_video
     """,
     "neuido.physics": "FiniteElements Frames MassSpring Mesh PlaneMotion PlaneSpecimen Simulator colliders effects laws mesh_body",
     "neuido.physics.colliders": """

@@ -145,3 +145,10 @@ def path_inside(folder: Path, relative: Any, where: str, *, kind: str = "folder"
     if windows.drive or windows.root or ".." in windows.parts or not stays:
         raise UserError(f"{where} = {relative!r} leaves the {kind} {folder}: give a path inside it")
     return path
+
+
+def with_prefix(value: float, unit: str) -> str:
+    """Format a number with three significant digits and an SI prefix, such as `98.3 kPa`."""
+    size = abs(value)
+    factor, prefix = next(((f, p) for f, p in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if size >= f), (1.0, ""))
+    return f"{value / factor:.3g} {prefix}{unit}"

@@ -13,12 +13,12 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from neuido.data.files.parsing import read_json
+from neuido.data.files.values import with_prefix
 from neuido.data.files.writing import atomic_write, write_json
 from neuido.data.weight_files import read_safetensors
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
-from neuido.models.operator.law_properties import with_prefix
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.physics.effects.parameters import Effects
 from neuido.types import ParticleState

@@ -2,6 +2,7 @@
 
 import math
 import os
+import time
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -48,6 +49,8 @@ class PreparedScene(NamedTuple):
     """Conditions of the encoder views, (V', 2); None without an encoder."""
     recorded_frames: tuple[int, ...] | None = None
     """Indices of the rollout frames that correspond to the recording, for uneven times; None: all frames."""
+    flow_seconds: float = 0.0
+    """Measured time from the images to the flow latents [s]; short where the flow was cached."""
 
     def __repr__(self) -> str:
         views, frames, height, width = self.images.shape[:4]
@@ -132,10 +135,12 @@ def prepare(
     if not training:
         raise UserError(f"{scene.name} has no training view: all {len(batch.held_out)} are held out")
     volume = conditions = None
+    begun = time.perf_counter()
     if encoder is not None:
         with torch.no_grad():
             velocities = encoder.measure_flow(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
             volume, conditions = (t.to(device) for t in encoder.embed(velocities))
+    flow_seconds = time.perf_counter() - begun
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device, graphs=graphs)
     if scene.gaussians is None:
         rest = simulator.volume / torch.linalg.det(simulator.state.F)  # a body may start deformed
@@ -159,6 +164,7 @@ def prepare(
         volume=volume,
         conditions=conditions,
         recorded_frames=recorded_frames,
+        flow_seconds=flow_seconds,
     )
 
 

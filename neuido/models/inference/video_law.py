@@ -15,6 +15,7 @@ from neuido.models.inference.prepared_scene import Laws, PreparedScene, as_devic
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import Moduli, small_strain_moduli
 from neuido.models.video.encoder import DynamicsEncoder
+from neuido.models.video.reader import Readings
 from neuido.types import ParticleState
 
 
@@ -29,6 +30,7 @@ class VideoLaw:
         frames: Number of recorded frames.
         seconds: Measured time from the flow latents to the law [s].
         prepared: The scene, which `rollout` needs.
+        readings: Family and properties of the material with their uncertainty; None of an encoder without a reader.
     """
 
     def __init__(
@@ -41,8 +43,9 @@ class VideoLaw:
         frames: int = 0,
         seconds: float | None = None,
         prepared: PreparedScene | None = None,
+        readings: Readings | None = None,
     ):
-        self.operator, self.latent, self.prepared = operator, latent.detach(), prepared
+        self.operator, self.latent, self.prepared, self.readings = operator, latent.detach(), prepared, readings
         self.scene, self.views, self.frames, self.seconds = scene, views, frames, seconds
         with torch.no_grad():
             young, poisson = small_strain_moduli(operator, self.latent[None])
@@ -63,8 +66,9 @@ class VideoLaw:
         """
         found = infer_latent(encoder, operator, prepared, repeat=repeat)
         views = 0 if prepared.volume is None else len(prepared.volume)
-        name = prepared.source.name
-        return cls(operator, found.z, scene=name, views=views, frames=prepared.frames, seconds=found.seconds, prepared=prepared)
+        readings = None if prepared.volume is None or prepared.conditions is None else encoder.read(prepared.volume, prepared.conditions)
+        known = {"scene": prepared.source.name, "views": views, "frames": prepared.frames, "seconds": found.seconds}
+        return cls(operator, found.z, **known, prepared=prepared, readings=readings)
 
     def law(self) -> Laws:
         """Return the elastic and the plastic law for `Simulator.rollout`."""
@@ -94,15 +98,26 @@ class VideoLaw:
         `neuido.models.load_law` reads the file; it does not need the operator.
         """
         card: dict[str, Any] = {"scene": self.scene, "views": self.views, "frames": self.frames, "seconds": self.seconds}
+        if self.readings is not None:
+            card["readings"] = self.readings.as_dict()
         save_law(Path(path), self.operator, self.latent, card | {"young": self.moduli.young, "poisson": self.moduli.poisson})
 
     def summary(self) -> str:
-        """Return the moduli with their units and the inference time in one line."""
-        return f"{self.moduli}" + ("" if self.seconds is None else f"; law read in {1e3 * self.seconds:.1f} ms")
+        """Return the moduli of the law with their units and the inference time in one line."""
+        if self.seconds is None:
+            return str(self.moduli)
+        whole = "" if self.prepared is None else f", {self.seconds + self.prepared.flow_seconds:.2g} s from the images"
+        return f"{self.moduli}; law read in {1e3 * self.seconds:.1f} ms{whole}"
+
+    def report(self) -> list[str]:
+        """Return the lines that `neuido predict` prints: the readings of the material, if there are any, and the summary of the law."""
+        readings = [] if self.readings is None else self.readings.lines()
+        return [*readings, self.summary() if self.readings is None else f"law: {self.summary()}"]
 
     def __repr__(self) -> str:
         name = f"{self.scene!r}, " if self.scene else ""
-        return f"VideoLaw({name}{self.moduli}, latent of {len(self.latent)}, {self.views} views, {self.frames} frames)"
+        read = "" if self.readings is None else f"{self.readings.family} ({100 * self.readings.families[self.readings.family]:.0f} %), "
+        return f"VideoLaw({name}{read}{self.moduli}, latent of {len(self.latent)}, {self.views} views, {self.frames} frames)"
 
 
 def read_law(
@@ -135,7 +150,7 @@ def read_law(
         device: `auto` (CUDA where available), `cpu`, or `cuda`.
 
     Returns:
-        The law: `.law()` for `Simulator.rollout`, `.moduli`, `.latent`, `.save(path)`, `.rollout()`.
+        The law: `.law()` for `Simulator.rollout`, `.readings`, `.moduli`, `.latent`, `.save(path)`, `.rollout()`.
 
     Raises:
         UserError: A file is missing or malformed, the frames are uneven, there is no training view, or the latents differ in length.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from neuido.data.files.values import with_prefix
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.laws.neural.networks import hencky_strain
 
@@ -21,13 +22,6 @@ class Moduli(NamedTuple):
 
     def __str__(self) -> str:
         return f"E = {with_prefix(self.young, 'Pa')}, nu = {self.poisson:.3f} (small strain)"
-
-
-def with_prefix(value: float, unit: str) -> str:
-    """Format a number with three significant digits and an SI prefix, such as `98.3 kPa`."""
-    size = abs(value)
-    factor, prefix = next(((f, p) for f, p in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if size >= f), (1.0, ""))
-    return f"{value / factor:.3g} {prefix}{unit}"
 
 
 def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> tuple[Tensor, Tensor]:

@@ -271,7 +271,10 @@ class AlignModule(ImageModule):
         folder = folder_of(self.hparams.out, scene.name)
         found.save(folder / "law.safetensors")
         answer: dict[str, Any] = {"scene": scene.name, "folder": str(folder), "seconds": found.seconds, **found.moduli._asdict()}
-        self.print(f"{scene.name}: {found.summary()}")
+        if found.readings is not None:
+            answer["readings"] = found.readings.as_dict()
+        for line in found.report():
+            self.print(f"{scene.name}: {line}")
         try:
             motion, halvings = found.rollout()
         except UserError as error:

@@ -26,8 +26,8 @@ from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
+from neuido.models.video.clip_bodies import GROUPS, frame_steps, launch, random_body
 from neuido.models.video.flow import PRESETS, measure_velocities
-from neuido.models.video.random_bodies import GROUPS, frame_steps, launch, random_body
 from neuido.physics.mpm.simulator import COURANT_LIMIT, Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from neuido.data.files.values import with_prefix
 from neuido.errors import UserError
-from neuido.models.operator.law_properties import with_prefix
 from neuido.models.video.material_properties import SYMBOLS, UNITS, from_scale
 from neuido.models.video.pooling import AttentionPool, positions
 

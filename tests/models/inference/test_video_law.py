@@ -7,11 +7,12 @@ import torch
 from lightning.pytorch import Trainer
 
 import neuido.models
+from neuido.data.files.values import with_prefix
 from neuido.errors import UserError
 from neuido.models import DynamicsEncoder, FlowVAE, Operator, VideoLaw, load_law, read_law, small_strain_moduli
 from neuido.models.inference.pipeline import infer_latent
 from neuido.models.inference.prepared_scene import prepare
-from neuido.models.operator.law_properties import p_wave_modulus, with_prefix
+from neuido.models.operator.law_properties import p_wave_modulus
 from neuido.models.stages.align import AlignModule
 from neuido.models.stages.warmup import WarmupModule
 from tests.models.visual_samples import TinyScenes, tiny_scene

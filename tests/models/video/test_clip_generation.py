@@ -15,6 +15,8 @@ from neuido.data.clips import FilmDataModule, read_clip
 from neuido.errors import UserError
 from neuido.models.stages.pretrain_vae import FlowVAEModule
 from neuido.models.stages.warmup import WarmupModule, compare_laws
+from neuido.models.video import clip_generation
+from neuido.models.video.clip_bodies import SOLIDS
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from neuido.physics.runtime.events import CRUSHED, INVERTED, Event
@@ -117,7 +119,7 @@ def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
     torch.manual_seed(0)
     FlowVAE(8).save(tmp_path / "vae.safetensors")
     options = {"vae": str(tmp_path / "vae.safetensors"), "flow_size": 32, "width": 48, "dropout": 0.0, "lr": 3e-3, "noise": 0.0}
-    module = WarmupModule(**options, save_to=str(tmp_path / "encoder.safetensors"))
+    module = WarmupModule(**options, reader_width=48, save_to=str(tmp_path / "encoder.safetensors"))
     frozen = {name: p.clone() for name, p in module.named_parameters() if "projector" not in name}
     data = FilmDataModule(str(folder), batch_size=6, frames=0, held_out=0.2)
     fit = trainer(tmp_path, max_steps=100, check_val_every_n_epoch=100)
@@ -127,7 +129,10 @@ def test_warm_up_learns_and_touches_the_projector_alone(folder, tmp_path):
     fit.fit(module, data)
     assert torch.stack(losses[-10:]).mean() < 0.6 * losses[0]
     assert frozen and all(torch.equal(p, dict(module.named_parameters())[name]) for name, p in frozen.items())
-    assert DynamicsEncoder.load(tmp_path / "encoder.safetensors").card["stage"] == "warm-up"
+    encoder = DynamicsEncoder.load(tmp_path / "encoder.safetensors")
+    assert encoder.card["stage"] == "warm-up" and encoder.card["figures"]["val/family"] <= 1
+    assert encoder.reader.families == ("elastic", "plasticine", "sand") and encoder.reader.limit < 100  # calibrated
+    assert encoder.reader.known.tolist() == [[1, 1, 0, 0, 0], [1, 1, 1, 0, 0], [1, 1, 0, 1, 0]]
 
 
 def test_judgement_is_the_same_for_twice_and_half():
@@ -147,3 +152,18 @@ def test_judgement_is_the_same_for_twice_and_half():
     assert twice.size.item() == pytest.approx(np.log(2), rel=1e-3) == half.size.item()
     assert twice.stress.item() == pytest.approx(1 / 3, rel=0.02) and half.stress.item() == pytest.approx(1 / 3, rel=0.02)
     assert same.stress == 0 and same.plastic == 0 and same.size < 1e-5
+
+
+def test_rates_shapes_and_a_clip_that_is_left_out(tmp_path, monkeypatch):
+    options = {**TINY, "count": 6, "rates": [60.0, 240.0], "held_out": 0.34, "samples": 8}
+    own = clip_generation.simulate_clips
+    monkeypatch.setattr(clip_generation, "simulate_clips", lambda group, *rest: [
+        None if clip.name == "clip-00001" else motion for clip, motion in zip(group, own(group, *rest))])  # fmt: skip
+    film(str(tmp_path), **options)
+    clips = json.loads((tmp_path / "index.json").read_text())["clips"]
+    assert [clip["name"] for clip in clips] == [f"clip-0000{k}" for k in (0, 2, 3, 4, 5)]
+    assert "left_out" in json.loads((tmp_path / "clip-00001.json").read_text())
+    assert all((clip["shape"] in SOLIDS["held-out"]) == (clip["name"] >= "clip-00004") for clip in clips)
+    assert all(60 <= 1 / read_clip(tmp_path / f"{clip['name']}.npz").frame_interval <= 240 for clip in clips)
+    with pytest.raises(UserError, match=r"rates = \[240.0, 60.0\]"):
+        film(str(tmp_path / "b"), **{**options, "rates": [240.0, 60.0]})
