@@ -19,7 +19,7 @@ import torch
 
 from neuido.data.bodies.families import effects, laws
 from neuido.data.files.writing import write_text
-from neuido.data.trajectories.options import FAMILIES
+from neuido.data.files.yaml_files import read_configuration
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_latent, rollout_laws, rollout_with_retries
 from neuido.models.inference.prepared_scene import PreparedScene, as_device, prepare
@@ -40,6 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--encoder", default="pretrained")
     parser.add_argument("--operator", default="pretrained")
+    parser.add_argument("--films", default="configs/films_materials.yaml", help="configuration of `neuido film`, for the materials")
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--views", type=int, default=2)
     parser.add_argument("--frames", type=int, default=80)
@@ -54,7 +55,9 @@ def main() -> None:
     given = parser.parse_args()
 
     device = as_device(given.device)
-    plan = ClipPlan(given.count, {f: dict(r) for f, r in FAMILIES.items()}, given.views, given.frames, 5, (1e-3,), given.cells,
+    ranges = read_configuration(given.films)["families"]
+    families = {family: {name: (low, high) for name, (low, high) in own.items()} for family, own in ranges.items()}
+    plan = ClipPlan(given.count, families, given.views, given.frames, 5, (1e-3,), given.cells,
                     given.particles, given.width, 64, "fast", 16, given.seed, tuple(given.rates), "unseen", given.published)  # fmt: skip
     operator = IntrinsicDynamicsOperator.load(given.operator).to(device).eval()
     encoder = DynamicsEncoder.load(given.encoder).to(device).eval()

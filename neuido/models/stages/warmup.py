@@ -279,7 +279,7 @@ class WarmupModule(LightningModule):
 
     def _viscosity_error(self, z: Tensor, viscosity: Tensor) -> Tensor | None:
         """Return the logarithmic error of the operator's viscosity, (B,); None for an operator without one."""
-        if getattr(self.operator, "viscosity_head", None) is None:
+        if self.operator.viscosity_head is None:
             return None
         return ((self.operator.viscosity(z) + VISCOSITY_FLOOR) / (viscosity + VISCOSITY_FLOOR)).log().abs()
 

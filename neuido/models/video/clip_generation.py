@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, evaluate, laws
+from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, effects, evaluate, laws
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
@@ -28,20 +28,14 @@ from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
 from neuido.models.video.clip_bodies import GROUPS, frame_steps, launch, random_body
 from neuido.models.video.flow import PRESETS, measure_velocities
+from neuido.physics.laws.resets import VolumetricReset
+from neuido.physics.linalg.decompositions import polar
 from neuido.physics.mpm.simulator import COURANT_LIMIT, Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
 
 DENSITY = 1000.0
 """Density of the bodies [kg/m^3]."""
-try:  # until the families have rates
-    from neuido.data.bodies.families import effects
-except ImportError:
-
-    def effects(family, parameters):
-        return None
-
-
 FLOORS = (0.0, 0.5, math.inf)
 """Friction coefficients of the floor, one of which is sampled for each clip."""
 
@@ -293,6 +287,8 @@ def _samples(motion: ParticleState, clip: ClipSetup, count: int) -> dict[str, Te
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(number)).to(F.device)
     trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float()
     corrected = evaluate(plastic, trial)
+    if isinstance(plastic, VolumetricReset):  # as in the trajectories of Stage I, whose operator is frame-indifferent
+        corrected = (polar(trial.double())[0] @ corrected.double()).float()
     return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": evaluate(elastic, corrected).cpu()}
 
 

@@ -4,7 +4,8 @@ import math
 
 import torch
 
-from neuido.data.bodies.families import evaluate, laws
+from neuido.data.bodies.families import effects, evaluate, laws
+from neuido.data.trajectories.reference_viscosity import reference_viscosity
 
 UNITS = {"young": "Pa", "poisson": "", "yield_stress": "Pa", "friction_angle": "°", "viscosity": "Pa s"}
 """The properties, and their units."""
@@ -33,8 +34,9 @@ def properties_of(family: str, parameters: dict[str, float]) -> dict[str, float]
     found = {}
     if mu > FLUID * along:
         found |= {"young": mu * (3 * lam + 2 * mu) / (lam + mu), "poisson": lam / (2 * (lam + mu))}
-    found |= {name: parameters[name] for name in ("yield_stress", "friction_angle", "viscosity") if name in parameters}
-    return found
+    found |= {name: parameters[name] for name in ("yield_stress", "friction_angle") if name in parameters}
+    viscosity = effective_viscosity(family, parameters)
+    return found | ({"viscosity": viscosity} if viscosity > 0 else {})
 
 
 def to_scale(name: str, value: float) -> float:
@@ -48,5 +50,5 @@ def from_scale(name: str, value: float) -> float:
 
 
 def effective_viscosity(family: str, parameters: dict[str, float]) -> float:
-    """Return the shear viscosity [Pa s] that a rollout of a material adds as an effect; zero for one without."""
-    return parameters.get("viscosity", 0.0)
+    """Return the shear viscosity [Pa s] of a material, zero for one without: that at a shear rate of 10 /s where it depends on the rate."""
+    return reference_viscosity(effects(family, [parameters]))
