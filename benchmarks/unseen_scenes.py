@@ -27,10 +27,11 @@ from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
 from neuido.models.scoring.motion_scores import chamfer_per_frame
 from neuido.models.stages.made_scenes import made_scenes
+from neuido.models.stages.true_properties import properties_of
 from neuido.models.video.clip_generation import ClipPlan
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow import Velocities
-from neuido.models.video.material_properties import LOGARITHMIC, properties_of
+from neuido.models.video.material_properties import LOGARITHMIC
 
 RANDOM = 3
 """Random latents of a scene, of whose Chamfer distances the median is taken."""
@@ -106,7 +107,7 @@ def motions(prepared: PreparedScene, operator: IntrinsicDynamicsOperator, z, cli
     """Return the Chamfer distances of the true law, the read law, the mean latent and random latents on the same body."""
     elastic, plastic = laws(clip.family, [clip.parameters])
     rates = effects(clip.family, [clip.parameters])
-    row = {"modulus": float(elastic.modulus()), "modulus_law": float(p_wave_modulus(operator, z[None])[0])}
+    row = {"modulus": float(elastic.modulus()), "modulus_law": float(p_wave_modulus(operator, z[None])[0].detach())}
     runs = {"true": [lambda scene: rollout_laws(scene, (elastic, plastic), scene.frames, effects=rates)]}
     mean = operator.latents.mean(0)
     drawn = operator.random_latents(RANDOM, torch.Generator().manual_seed(0))

@@ -28,7 +28,8 @@ from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
 from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
-from neuido.models.video.material_properties import LENGTH_POWERS, LOGARITHMIC, UNITS, effective_viscosity, properties_of, to_scale
+from neuido.models.stages.true_properties import effective_viscosity, properties_of
+from neuido.models.video.material_properties import LENGTH_POWERS, LOGARITHMIC, UNITS, to_scale
 from neuido.models.video.reader import NORMAL, Distribution, Reader
 
 READ, EMBEDDED = 64, 16

@@ -9,9 +9,10 @@ from safetensors.torch import save_file
 
 from neuido.data.bodies.families import laws
 from neuido.errors import UserError
+from neuido.models.stages.true_properties import properties_of
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
-from neuido.models.video.material_properties import LENGTH_POWERS, UNITS, from_scale, properties_of, to_scale
+from neuido.models.video.material_properties import LENGTH_POWERS, UNITS, from_scale, to_scale
 from neuido.models.video.reader import Distribution, Reader
 
 FAMILIES = ["elastic", "plasticine"]
