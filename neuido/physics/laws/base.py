@@ -165,6 +165,10 @@ class ElasticLaw(Law):
         """Return the P-wave modulus at each particle [Pa], (P,) float64, where it differs within a scene; else None."""
         return None
 
+    def particle_viscosity(self) -> Tensor | None:
+        """Return the shear viscosity at each particle [Pa s], (P,) float64, where laws of a scene bring one; else None."""
+        return None
+
 
 class PlasticLaw(Law):
     """Map the trial deformation gradient to the corrected one."""

@@ -130,6 +130,18 @@ class CompositeElastic(CompositeLaw, ElasticLaw):
             out[rows] = own[_particles(part, rows).scene.long().clamp(max=len(own) - 1)]
         return out
 
+    def particle_viscosity(self) -> Tensor | None:
+        if all(part.law.viscosity is None for part in self.parts):
+            return None
+        out = torch.zeros(len(self.order), dtype=torch.float64, device=self.order.device)
+        for part in self.parts:
+            if part.law.viscosity is not None:
+                rows = self.order[part.rows]
+                out = out.index_put(
+                    (rows,), part.law.viscosity.to(out)[_particles(part, rows).scene.long().clamp(max=len(part.law.viscosity) - 1)]
+                )
+        return out
+
 
 class CompositePlastic(CompositeLaw, PlasticLaw):
     """Plastic laws that differ between particles; made by `laws_of_bodies` and `by_body`."""
@@ -262,12 +274,17 @@ def _merged(parts: list[Part], device: torch.device) -> list[Part]:
     """Join classical laws of neighbouring ranges to one part, so that they share a launch."""
     out: list[list[Part]] = []
     for part in parts:
-        alike = isinstance(part.law, ParametricLaw) and out and isinstance(out[-1][0].law, ParametricLaw)
+        alike = out and all(_can_be_joined(law) for law in (part.law, out[-1][0].law))
         if alike and part.law.tensors()[0].device == out[-1][0].law.tensors()[0].device:
             out[-1].append(part)
         else:
             out.append([part])
     return [group[0] if len(group) == 1 else _joined(group, device) for group in out]
+
+
+def _can_be_joined(law: Law) -> bool:
+    """Return whether a law may share a launch: a classical one that brings no viscosity of its own."""
+    return isinstance(law, ParametricLaw) and getattr(law, "viscosity", None) is None
 
 
 def _joined(parts: Sequence[Part], device: torch.device) -> Part:

@@ -132,7 +132,7 @@ def run_backward(
                 spin.adjoint(inputs[SPIN_LOSS], mass, x, v, C, a_loss, a_mass, a_x, a_v, a_C)
             if viscosity.numel():
                 plan.launch(k.add_viscous_stress_adjoint, len(x),
-                            [setup.particles.scene, viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
+                            [setup.viscosity_rows(viscosity), viscosity, C, F, a_tau, a_C, a_F, a_viscosity])  # fmt: skip
             if material is not None and a_material is not None:
                 assert plan.effects is not None  # the kernels of the tables
                 if material.stiffness is not None or material.growth is not None or plan.layout.e_max or plan.layout.compaction:

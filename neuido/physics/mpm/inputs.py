@@ -48,13 +48,19 @@ class RolloutInputs(NamedTuple):
     mass: Tensor
     """Particle masses [kg], (P,), with the effects `added_mass` and `relative_density`."""
     viscosity: Tensor | None
-    """`Effects.viscosity` [Pa s], (S, 2), with the viscosity of the elastic law."""
+    """`Effects.viscosity` with that of the elastic law [Pa s], (S, 2), or (P, 2) where it differs between the bodies of a scene."""
     tables: Tables | None
     """Tables of the effects that act on the law; None without such effects."""
     stiffness: Tensor | None
     """Factor of each particle's elastic stress [-], (P,)."""
     growth: Tensor | None
     """`Effects.growth` over the steps of the solver [-], (T, S)."""
+
+    def largest_viscosity(self, solver: Solver) -> Tensor | None:
+        """Return the largest viscosity of each scene [Pa s], (S, 2)."""
+        if self.viscosity is None or len(self.viscosity) <= solver.scene_count:
+            return self.viscosity
+        return torch.stack([self.viscosity[i:j].detach().amax(0) for i, j in pairwise(solver.particles.offsets)])
 
     def stiffening(self, solver: Solver) -> tuple[Tensor, Tensor] | None:
         """Return what the effects add to the P-wave modulus of each scene [Pa], and a factor on the sum [-], (S,) float64 each.
@@ -121,7 +127,7 @@ def prepare(
         force=effects.force_table(count, like).contiguous(),
         friction=friction.contiguous(),
         mass=mass,
-        viscosity=effects.viscosity(count, like),
+        viscosity=_with_bodies(effects.viscosity(count, like), elasticity, solver),
         tables=tables,
         stiffness=stiffness,
         growth=growth,
@@ -134,6 +140,15 @@ def with_viscosity(effects: Effects, viscosity: Tensor | None) -> Effects:
         return effects
     own = effects.viscosity_shear
     return effects._replace(viscosity_shear=viscosity if own is None else torch.as_tensor(own).to(viscosity) + viscosity)
+
+
+def _with_bodies(viscosity: Tensor | None, elasticity: ElasticLaw, solver: Solver) -> Tensor | None:
+    """Return the viscosity of the effects [Pa s], (S, 2), with that of the bodies' laws where they bring one, (P, 2)."""
+    each = elasticity.particle_viscosity()
+    if each is None:
+        return viscosity
+    own = each.to(solver.mass)[:, None] * solver.mass.new_tensor([1.0, 2.0 / 3.0])
+    return own if viscosity is None else own + viscosity[solver.particles.scene.long()]
 
 
 def waves(

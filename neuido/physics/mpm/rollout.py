@@ -282,7 +282,7 @@ def stress(
         F: Deformation gradient [-], (P, 3, 3).
         C: Affine velocity [1/s], (P, 3, 3).
         history: History at F.
-        viscosity: `Effects.viscosity` [Pa s], (S, 2), or empty.
+        viscosity: `RolloutInputs.viscosity` [Pa s], or empty.
         material: Tables of material effects in the substep, or None.
         tau: Kirchhoff stress [Pa], (P, 3, 3); overwritten.
     """
@@ -292,7 +292,7 @@ def stress(
         assert plan.effects is not None  # the kernels of the tables
         plan.launch(plan.effects.add_effect_stress, len(F), [*stress_inputs(plan, material), material.all_branches, F, history, tau])
     if viscosity.numel():
-        plan.launch(setup.kernels.add_viscous_stress, len(F), [setup.particles.scene, viscosity, C, F, tau])
+        plan.launch(setup.kernels.add_viscous_stress, len(F), [setup.viscosity_rows(viscosity), viscosity, C, F, tau])
 
 
 def stress_inputs(plan: Plan, material: Material) -> list:

@@ -232,7 +232,7 @@ class Simulator:
         """
         elasticity, plasticity = self._laws(elasticity, plasticity)
         given = inputs.prepare(self, steps, elasticity, plasticity, effects=effects)
-        limits = self.step_limits(elasticity, given.viscosity, given.mass, given.stiffening(self))
+        limits = self.step_limits(elasticity, given.largest_viscosity(self), given.mass, given.stiffening(self))
         crossing = [scene.dx / max(speed, 1e-30) for speed, scene in zip(self._speeds(), self.scenes)]
         return min(min(*limit, own) / scene.dt for limit, own, scene in zip(limits, crossing, self.scenes))
 
@@ -358,7 +358,7 @@ class Simulator:
             self, steps, elasticity, plasticity, state=state, effects=effects, gravity=gravity, friction=friction, mass=mass
         )
         pull = given.effects.accelerations(given.gravity, self.dt, steps).contiguous()
-        step = (elasticity, given.viscosity, given.mass, given.stiffening(self))
+        step = (elasticity, given.largest_viscosity(self), given.mass, given.stiffening(self))
         refused = [""] * self.scene_count
         if check and nan_on_failure:
             refused = self._refusals(*step)
@@ -372,7 +372,10 @@ class Simulator:
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
         start = [t[self.order] for t in (*given.state, history, mass)]
-        optional = [given.viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
+        viscosity = given.viscosity
+        if viscosity is not None and len(viscosity) > self.scene_count:
+            viscosity = viscosity[self.order]
+        optional = [viscosity, None if given.stiffness is None else given.stiffness[self.order], given.growth]
         optional += [None] * 3 if tables is None else [tables.material, tables.branches, tables.flow]
         between = None if self.setup.contact is None else self.setup.contact.frictions(body_friction)
         optional += [shrinkage, loss, between, *self._solid_tensors(steps, solids, given.effects)]

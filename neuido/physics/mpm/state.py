@@ -280,6 +280,11 @@ class Setup:
         self.order = torch.argsort(key, stable=True)
         self.inverse = torch.argsort(self.order)
         self.sorted_volume, self.sorted_held = self.volume[self.order].contiguous(), self.held[self.order].contiguous()
+        self.numbers = torch.arange(len(self.order), dtype=torch.int32, device=self.device)
+
+    def viscosity_rows(self, viscosity: Tensor) -> Tensor:
+        """Return the row of each particle in a table of viscosities, (P,) int32: its scene, or its number in a table of all particles."""
+        return self.particles.scene if len(viscosity) <= self.scene_count else self.numbers
 
     def single_scene(self, s: int) -> "Setup":
         """Return the set-up of scene s alone, with its particles in the order that they have here."""

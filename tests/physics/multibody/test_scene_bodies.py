@@ -5,6 +5,7 @@ import torch
 
 from neuido.data.bodies import shapes
 from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import AutogradElastic
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, Sigma, VonMises
 from neuido.physics.mpm.simulator import Simulator
@@ -47,6 +48,28 @@ def test_apart_each_body_moves_as_in_a_scene_of_its_own(contact, own):
     assert torch.allclose(together.x[-1], torch.cat([frames.x[-1] for frames in alone]), atol=1e-12)
     assert together.body_names == ("left", "right")
     assert together.body.bincount().tolist() == [64, 64]
+
+
+def test_each_body_has_the_viscosity_of_its_law():
+    viscous = FixedCorotated(1e4, 0.2)
+    eta = torch.tensor([3.0], dtype=torch.float64, requires_grad=True)
+    viscous.viscosity = eta
+    spin = {"spin": (0.0, 0.0, 9.0)}
+    bodies = left(law=viscous, **spin), right(law=FixedCorotated(1e4, 0.2), **spin)
+    effects = Effects(viscosity_shear=1.0)
+    together = simulator(*bodies).rollout(60, every=60, effects=effects)
+    plain = left(law=FixedCorotated(1e4, 0.2), **spin)
+    with torch.no_grad():
+        alone = [simulator(plain).rollout(60, every=60, effects=Effects(viscosity_shear=4.0))]
+        alone += [simulator(bodies[1]).rollout(60, every=60, effects=effects)]
+        less = simulator(plain).rollout(60, every=60, effects=effects)
+    assert torch.allclose(together.x[-1].detach(), torch.cat([frames.x[-1] for frames in alone]), atol=1e-12)
+    assert (less.x[-1] - alone[0].x[-1]).abs().max() > 1e-6
+    together.x[-1].square().sum().backward()
+    assert eta.grad.abs().item() > 0
+    viscous.viscosity = torch.tensor([1e4])
+    with pytest.raises(UserError, match="viscosity of 1e\\+04"):
+        simulator(*bodies).rollout(1)
 
 
 def test_a_single_body_with_a_law_moves_as_one_beside_its_scene():
