@@ -1,5 +1,6 @@
 """Every YAML under configs is accepted by the real command line."""
 
+import functools
 import inspect
 import re
 import shlex
@@ -26,6 +27,7 @@ ROOT = neuido.configs_root()
 CONFIGS = sorted(ROOT.rglob("*.yaml"))
 
 
+@functools.cache  # a hundred files of some pages, each of which is asked for several times
 def content(path) -> dict:
     """What a configuration says, that of its base included."""
     return read_configuration(path)
@@ -59,13 +61,16 @@ def of_a_command(path) -> bool:
     return whole and (path.parent.name != "scenes" or "scenes" in content(path))
 
 
+WHOLE = [path for path in CONFIGS if of_a_command(path)]
+
+
 def to_try(path):
     """The first of a folder; the others, which are built of the same classes, in the slow tier."""
-    first = next(other for other in CONFIGS if other.parent == path.parent and of_a_command(other))
+    first = next(other for other in WHOLE if other.parent == path.parent)
     return path if path == first or path.parent == ROOT else pytest.param(path, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("path", [to_try(path) for path in CONFIGS if of_a_command(path)], ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", [to_try(path) for path in WHOLE], ids=lambda p: p.stem)
 def test_command_line_accepts(path, capsys):
     command = command_of(path)
     assert command is not None, f"no command takes {path.name}"

@@ -58,6 +58,8 @@ def run_page(page: Path, folder: Path) -> str:
         assert match, "a YAML block starts with its file name"
         (folder / match[1]).write_text(block)
     code = "\n".join(block for block in blocks(page, "python") if not block.startswith("# needs data"))
+    if re.search(r"\.show\(|neuido\.view\(", code):
+        pytest.importorskip("viser", reason="viser is not installed: pip install neuido[viewer]")
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, env=environment, check=False)
     assert done.returncode == 0, done.stderr

@@ -3,10 +3,10 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,9 +19,10 @@ from neuido.commands.sweep import scored, sweep
 from neuido.data.files.score_tables import write_rows
 from neuido.data.files.sweep_run import own_folder, redirect
 from neuido.errors import UserError
+from tests.waiting import wait_for
 
 ROOT = Path(neuido.__file__).parents[1]
-SWEEPS = sorted(path for path in neuido.configs_root().rglob("*.yaml") if "parameters" in yaml.safe_load(path.read_text()))
+SWEEPS = sorted(path for path in neuido.configs_root().rglob("*.yaml") if re.search(r"^parameters:", path.read_text(), re.MULTILINE))
 GRID = {"a": {"values": [1, 2, 3]}, "model.b": {"values": ["x", "y"]}, "c": {"value": 5}}
 PROGRAM = """
 import os, sys, csv, pathlib
@@ -240,15 +241,14 @@ def test_killed_run_starts_anew(plan, tmp_path):
 
 def test_run_that_another_process_holds_is_left_alone(tmp_path):
     """A sweep that is killed leaves its run alive, and a second sweep leaves that run alone."""
-    (tmp_path / "prog.py").write_text("import time, sys; print('running', flush=True); time.sleep(30)")
+    (tmp_path / "prog.py").write_text("import time, sys; print('running', flush=True); time.sleep(600)")
     path = write(tmp_path, command=[sys.executable, str(tmp_path / "prog.py"), "${args}"], parameters={"a": {"values": [1]}})
     out = tmp_path / "out"
     code = f"from neuido.commands.sweep import sweep; sweep({path!r}, out={str(out)!r})"
     first = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, start_new_session=True, stdout=subprocess.DEVNULL)
     try:
-        log, until = out / "a-1" / "log.txt", time.monotonic() + 60
-        while not (log.exists() and log.read_text()) and time.monotonic() < until:
-            time.sleep(0.05)
+        log = out / "a-1" / "log.txt"
+        wait_for(lambda: log.exists() and log.read_text(), first)
         first.kill()
         first.wait()
         assert sweep(path, out=str(out)) == 0

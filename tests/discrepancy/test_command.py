@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.discrepancy.workflow import solved_by
 from tests import command
 from tests.discrepancy import made
+from tests.waiting import wait_for
 
 ROOT = Path(neuido.__file__).parents[1]
 DRAGS = ["--effects", "drag_linear,drag_quadratic,gravity", "--progress", "false"]
@@ -249,11 +249,7 @@ def test_killed_run_goes_on_to_the_same_answer(folders, track_answer, tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "neuido", "diagnose", str(folders["track"]), "--out", str(out), *DRAGS]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 60
-    while len(list(out.glob(".work/*/0/*.npy"))) < 6:
-        assert process.poll() is None, "it ended before it was killed"
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_for(lambda: len(list(out.glob(".work/*/0/*.npy"))) >= 6, process)
     process.send_signal(signal.SIGKILL)
     process.wait()
     kept = list(out.glob(".work/*/0/*.npy"))

@@ -18,6 +18,7 @@ from neuido.commands.cli.interruption import SIGNALS, received, stop_at_step, wa
 from neuido.commands.main import main
 from neuido.commands.sweep import sweep
 from neuido.data.sampling import FixedBatches, ResumableLoader
+from tests.waiting import HANGS, wait_for
 
 FIT = {
     "model": {"class_path": "PretrainModule", "init_args": {"latent_dim": 4, "instance_steps": 1}},
@@ -68,14 +69,6 @@ def begin(folder: Path, *args: str) -> subprocess.Popen:
     return BEGUN[-1]
 
 
-def wait_for(condition, process: subprocess.Popen, seconds: float = 400.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < until, "nothing happened"
-        time.sleep(0.02)
-
-
 def logged(folder: Path) -> bool:
     return any(path.read_text().count("\n") > 2 for path in folder.rglob("metrics.csv"))
 
@@ -89,7 +82,7 @@ def interrupted(folder: Path, number: signal.Signals, *args: str) -> Path:
     process = begin(folder, *args)
     wait_for(lambda: logged(folder), process)
     process.send_signal(number)
-    _, err = process.communicate(timeout=400)
+    _, err = process.communicate(timeout=HANGS)
     assert process.returncode == 128 + number, err
     assert err.splitlines()[-1] == f"neuido: interrupted by {number.name}" and "Traceback" not in err
     (state,) = folder.rglob("interrupted.ckpt")
@@ -110,7 +103,7 @@ def test_an_interrupted_fit_goes_on_to_the_same_bits(made, tmp_path):
     assert torch.load(state, weights_only=True)["global_step"] < 1500
     for name, more in (("resumed", [f"--ckpt_path={state}"]), ("whole", [])):
         done = begin(tmp_path, *fit(made, *end, f"--model.save_to={name}.safetensors", *more))
-        assert done.communicate(timeout=300) and done.returncode == 0
+        assert done.communicate(timeout=HANGS) and done.returncode == 0
     resumed, whole = (load_file(tmp_path / f"{name}.safetensors") for name in ("resumed", "whole"))
     assert resumed.keys() == whole.keys() and all(torch.equal(resumed[name], whole[name]) for name in whole)
 
@@ -188,7 +181,7 @@ def test_a_light_command_ends_with_the_signal_and_leaves_nothing_half_written(tm
     process = begin(tmp_path, *args)
     wait_for(lambda: (tmp_path / "out" / "plan.json").exists(), process)
     process.send_signal(number)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=HANGS)
     assert process.returncode == 128 + number and err.startswith("neuido: interrupted") and err.count("\n") == 1
     assert [path.name for path in (tmp_path / "out").iterdir() if not path.name.startswith(".")] == ["plan.json"]
 
@@ -222,15 +215,18 @@ def test_a_sweep_takes_an_interrupted_fit_up_again(made, tmp_path, monkeypatch):
     process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
     wait_for(lambda: logged(tmp_path / "out"), process)
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=400)
+    process.communicate(timeout=HANGS)
     assert process.returncode == 128 + signal.SIGTERM and status(tmp_path / "out") == ["interrupted"]
     (state,) = (tmp_path / "out").rglob("interrupted.ckpt")
     step = torch.load(state, weights_only=True)["global_step"]
     before = set((tmp_path / "out").rglob("metrics.csv"))
     process = begin(tmp_path, "sweep", file, "--out", "out", "--report=false")
-    wait_for(lambda: any(p.read_text().count("\n") > 2 for p in set((tmp_path / "out").rglob("metrics.csv")) - before), process)
+    wait_for(
+        lambda: any(p.read_text().count("\n") > 2 for p in set((tmp_path / "out").rglob("metrics.csv")) - before),
+        process,
+    )
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=400)
+    process.communicate(timeout=HANGS)
     assert torch.load(state, weights_only=True)["global_step"] > step
 
 

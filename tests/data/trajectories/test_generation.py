@@ -4,7 +4,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import time
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from neuido.data.trajectories import trajectory_files
 from neuido.data.trajectories.options import FAMILIES, make_trajectories
 from neuido.data.trajectories.reference_viscosity import REFERENCE_RATE, reference_viscosity
 from neuido.errors import UserError
+from tests.waiting import wait_for
 
 from .conftest import TINY
 
@@ -161,9 +161,7 @@ def test_killed_run_leaves_no_broken_file(tmp_path):
     options = TINY | {"steps": 400, "velocity": (1.0, -1.5, -2.0)}
     worker = multiprocessing.get_context("spawn").Process(target=make_trajectories, args=(str(tmp_path),), kwargs=options)
     worker.start()
-    deadline = time.monotonic() + 60
-    while not list(tmp_path.glob("*.npy")) and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(lambda: list(tmp_path.glob("*.npy")), worker)
     os.kill(worker.pid, signal.SIGKILL)
     worker.join()
     made = list(tmp_path.glob("*.npy"))

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from neuido.models.stages.image_module import sample_views
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow_vae import FlowVAE
 from tests.models.visual_samples import TinyScenes, tiny_scene
+from tests.waiting import HANGS, wait_for
 
 ROOT = Path(__file__).parents[3]
 
@@ -167,7 +167,7 @@ def start(folder, vae, processes, epochs, pause=0.0, resume="no"):
 
 
 def finish(process):
-    printed, _ = process.communicate(timeout=240)
+    printed, _ = process.communicate(timeout=HANGS)
     assert process.returncode == 0, printed[-3000:]
 
 
@@ -192,9 +192,7 @@ def test_two_processes_do_what_one_does_with_both_scenes(vae, tmp_path):
 def test_a_killed_run_goes_on_where_it_was(vae, tmp_path):
     whole, broken = start(tmp_path / "whole", vae, 0, 4), start(tmp_path / "broken", vae, 0, 4, pause=0.5)
     last = tmp_path / "broken" / "last.ckpt"
-    deadline = time.monotonic() + 120
-    while len(losses(tmp_path / "broken")) < 4 and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_for(lambda: len(losses(tmp_path / "broken")) >= 4, broken)
     broken.send_signal(signal.SIGKILL)
     broken.communicate()
     assert broken.returncode == -signal.SIGKILL

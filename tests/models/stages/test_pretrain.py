@@ -26,6 +26,7 @@ from neuido.models.stages.operator_scores import (
 from neuido.models.stages.pretrain import PretrainModule
 from neuido.physics.laws.classical import FixedCorotated, Sigma, VonMises
 from neuido.types import TrajectoryBatch
+from tests.waiting import HANGS, wait_for
 
 SMALL = {"latent_dim": 8, "basis_dim": 8, "hidden_dim": 16, "head_dim": 16}
 
@@ -190,15 +191,12 @@ def test_killed_and_resumed_ends_with_the_same_weights(folder, tmp_path):
         return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[3])
 
     def finish(process):
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=HANGS)
         assert process.returncode == 0, errors
 
     last = tmp_path / "killed" / "last.ckpt"
     killed, whole = start("killed"), start("whole")
-    deadline = time.monotonic() + 90
-    while not last.is_file():
-        assert killed.poll() is None and time.monotonic() < deadline, "the run ended before its first checkpoint"
-        time.sleep(0.005)
+    wait_for(last.is_file, killed)
     time.sleep(0.05)
     killed.send_signal(signal.SIGKILL)
     killed.communicate()
