@@ -171,6 +171,11 @@ class AlignModule(ImageModule):
         self._log({"train/loss": loss, f"train/{scene.name}": loss, "train/silhouette": silhouette, "train/frames": float(frames)})
         return total
 
+    def on_train_batch_end(self, outputs: Any, batch: VisualScene, batch_idx: int) -> None:
+        """Release the tape of the scene's rollout where those of all scenes would not fit beside each other."""
+        if not self._few_scenes():
+            self.prepared(batch).simulator.cache.clear()
+
     def _mean_latent(self, z: Tensor) -> Tensor:
         """Return the mean latent of Stage I, whose law can be simulated."""
         return self.operator.latents.mean(0).to(z) if len(self.operator.latents) else torch.zeros_like(z)

@@ -154,6 +154,12 @@ class RolloutCache:
             own = sum(t.numel() * t.element_size() for tape in tapes for t in tape if isinstance(t, Tensor))
             return own + sum(cache.held_bytes() for cache in self._single.values())
 
+    def clear(self) -> None:
+        """Release the tapes and graphs, which the next rollout makes anew."""
+        with self.lock:
+            self._rollouts.clear()
+            self._single.clear()
+
     def find(self, plan: Plan, inputs: Sequence[Tensor], keep_all: bool) -> CachedRollout:
         """Return the cached rollout for a plan and inputs of these shapes, or make one; captured if graphs are on and the laws allow it."""
         own = plan.key(inputs) if self.graphs else None
