@@ -81,9 +81,9 @@ def main() -> None:
               + ", ".join(f"{k} {row[k]:.3g}" for k in ("young", "young_read", "cd_true", "cd_read") if k in row)
               + f", {row.get('family_read')}", flush=True)  # fmt: skip
         write_rows(rows, Path(f"{given.out}.csv"))
-    summary = summarise(rows, f"{given.encoder}, {len(rows)} scenes, {time.perf_counter() - start:.0f} s on {device}")
-    write_text(Path(f"{given.out}.md"), summary)
-    print(summary)
+        title = f"{Path(given.encoder).name}, {len(rows)} scenes, {time.perf_counter() - start:.0f} s on {device}"
+        write_text(Path(f"{given.out}.md"), summarise(rows, title))
+    print(Path(f"{given.out}.md").read_text())
 
 
 def read(encoder: DynamicsEncoder, volume, conditions, clip, seen: Velocities) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def motions(prepared: PreparedScene, operator: IntrinsicDynamicsOperator, z, cli
         for run in own:
             try:
                 with torch.no_grad():
-                    motion, _ = rollout_with_retries(prepared, run)
+                    motion, _ = rollout_with_retries(prepared, run, 2 if name in ("true", "read") else 0)
                 found.append(float(chamfer_per_frame(prepared, motion).mean()))
             except UserError:
                 found.append(math.inf)
