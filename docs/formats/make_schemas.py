@@ -75,6 +75,29 @@ PLASTICITY = {
         record({"law": one_of(["drucker_prager"]), "friction_angle": {"type": "number", "minimum": 0, "maximum": 90}}),
     ]
 }
+SCENE_ELASTICITY = {
+    "oneOf": [
+        *ELASTICITY["oneOf"],
+        record({"law": one_of(["mooney_rivlin"]), "c10": POSITIVE, "c01": NOT_NEGATIVE, "bulk": POSITIVE}),
+        record({"law": one_of(["gent"]), "shear": POSITIVE, "limit": POSITIVE, "bulk": POSITIVE}),
+        record(
+            {
+                "law": one_of(["hyperfoam"]),
+                "shear": POSITIVE,
+                "exponent": POSITIVE,
+                "poisson": {"type": "number", "minimum": -1, "maximum": 0.5},
+            }
+        ),
+        record({"law": one_of(["fluid"]), "bulk": POSITIVE}),
+    ]
+}
+SCENE_PLASTICITY = {
+    "oneOf": [
+        *PLASTICITY["oneOf"],
+        record({"law": one_of(["volumetric_reset"])}),
+        record({"law": one_of(["snow"]), "compression": {**POSITIVE, "exclusiveMaximum": 1}, "stretch": POSITIVE}),
+    ]
+}
 CONTACT = one_of(["sticky", "slip", "separate"])
 PLANE = record({"type": one_of(["plane"]), "point": VECTOR, "normal": VECTOR, "contact": CONTACT}, {"friction": NOT_NEGATIVE})
 COLLIDERS = {"type": ["array", "null"], "items": PLANE}
@@ -125,6 +148,7 @@ FREE = {"type": "array", "items": TEXT, "uniqueItems": True}
 
 def schemas() -> dict[str, Schema]:
     """Return the schema of each format by its file name."""
+    from neuido.data.bodies.scene_files import EFFECTS
     from neuido.data.measured import material_test, track
     from neuido.data.measured.columns import ROLES
     from neuido.discrepancy.report import diagnosis_format
@@ -240,7 +264,10 @@ def schemas() -> dict[str, Schema]:
             },
             {"nuisances": {"oneOf": [{"type": "null"}, record({}, dict.fromkeys(track.NUISANCES, NOT_NEGATIVE))]}},
         ),
-        "neuido-scene-1": _scene(record({"density": POSITIVE, **material}, {"plasticity": PLASTICITY})),
+        "neuido-scene-1": _scene(
+            record({"density": POSITIVE, "elasticity": SCENE_ELASTICITY}, {"plasticity": SCENE_PLASTICITY}),
+            {"effects": {"type": ["object", "null"], "properties": dict.fromkeys(EFFECTS, NOT_NEGATIVE), "additionalProperties": False}},
+        ),
         "neuido-diagnosis-1": _older_diagnosis(names),
         "neuido-diagnosis-2": diagnosis_format.schema(),
     }
@@ -248,8 +275,8 @@ def schemas() -> dict[str, Schema]:
     return {f"{name}.schema.json": {"$schema": dialect, "title": name, **schema} for name, schema in formats.items()}
 
 
-def _scene(model: Schema) -> Schema:
-    """Return the schema of a scene file: of one body with its model, or of several bodies and the contact between them."""
+def _scene(model: Schema, effects: Schema) -> Schema:
+    """Return the schema of a scene file: of one body with its model and effects, or of several bodies and the contact between them."""
     shape = {"type": "object", "properties": {"shape": one_of(["cube", "box", "ball", "cylinder", "mesh"])}, "required": ["shape"]}
     body = {"anyOf": [record({"particles": TEXT}), shape]}
     pair = {"type": "array", "prefixItems": [TEXT, TEXT, NOT_NEGATIVE], "minItems": 3, "maxItems": 3}
@@ -259,7 +286,8 @@ def _scene(model: Schema) -> Schema:
     more = {"source": {"type": "string"}, "on_inversion": one_of(["report", "error"]), "on_leave": one_of(["error", "clamp", "delete"])}
     contact = record({"kind": one_of(["sticky", "separate"])}, {"friction": friction})
     several = record(common | {"bodies": some(record({"name": TEXT, "model": model, "body": body}))}, more | {"contact": contact})
-    return {"anyOf": [record(common | {"model": model, "body": body}, more), several]}
+    alone = {**model, "properties": model["properties"] | effects}
+    return {"anyOf": [record(common | {"model": alone, "body": body}, more), several]}
 
 
 def _constraints(types: Any) -> list[Schema]:

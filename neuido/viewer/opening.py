@@ -140,7 +140,7 @@ def _live_of_file(
         laws = tuple(law) if isinstance(law, Sequence) else (law, None)
         family = LawFamily(lambda values: laws, ())  # type: ignore[arg-type, return-value]
     elif setup.body is not None:
-        family = classical_family(setup.info["elasticity"], setup.info["plasticity"])
+        family = classical_family(setup.info["elasticity"], setup.info["plasticity"], setup.info["effects"])
     else:
         family = LawFamily(lambda values: simulator.own_laws, ())
     simulator = Simulator(setup.scene, setup.body, density=setup.info.get("density", 1000.0))

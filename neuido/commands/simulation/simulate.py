@@ -55,6 +55,7 @@ def simulate(
 
     from neuido.data.bodies.scene_files import load_scene
     from neuido.models.inference.law_file import load_law
+    from neuido.physics.effects.parameters import Effects
     from neuido.physics.laws.classical import material
     from neuido.physics.mpm.simulator import Simulator
 
@@ -68,6 +69,8 @@ def simulate(
     spacing = next(k for k in range(-(-count // FRAMES), count + 1) if count % k == 0) if every is None else every
     models = setup.info.get("models") or [setup.info]
     laws: tuple = ()
+    beside = {} if law is not None else setup.info.get("effects", {})
+    effects = Effects.of(beside) if beside else None
     if law is not None:
         laws = load_law(law)
     elif setup.body is not None:
@@ -79,7 +82,7 @@ def simulate(
     start = time.perf_counter()
     with new_folder(folder) as hidden:
         with Progress(f"simulating {setup.info['name']}, {count} substeps in one run", shown=progress):
-            frames = simulator.rollout(count, *laws, every=spacing)
+            frames = simulator.rollout(count, *laws, every=spacing, effects=effects)
         seconds = time.perf_counter() - start
         try:
             frames.save(hidden / "frames.npz")
@@ -98,6 +101,7 @@ def simulate(
     for model in models:
         told = f"the law of {law}" if law else ", ".join(_told(model[part]) for part in ("elasticity", "plasticity"))
         name = "" if setup.body is not None else f" of {model['name']}"
+        told += "".join(f", {key} {value:g}" for key, value in beside.items())
         print(f"law{name}: {told}; density {model['density']:g} kg/m^3")
     fall, share = float(frames.x[-1, :, 1].mean() - frames.x[0, :, 1].mean()), torch.linalg.det(frames.F[-1].double())
     speed = float(frames.v[-1].norm(dim=1).max())

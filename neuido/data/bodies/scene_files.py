@@ -32,6 +32,8 @@ from neuido.types import AttachedMass, Body, Box, Plane, Scene, Solid, Walls
 FORMAT = "neuido-scene/1"
 KEYS = ("format", "name", "source", "scene", "model", "body", "bodies", "contact", "discretisation", "steps", "on_inversion", "on_leave")
 VARIABLE = "NEUIDO_DATA"
+EFFECTS = ("viscosity_shear.eta", "viscosity_bulk.zeta", "rate_yield.eta", "rate_yield.index", "compaction_hardening.xi")
+"""Effects that the model of a scene file may have: those that belong to the law of a fluid, of honey and of snow."""
 CONTACTS = ("sticky", "slip", "separate")
 
 
@@ -44,7 +46,7 @@ class SceneSetup(NamedTuple):
     """The body; None where the file lists several."""
     info: dict[str, Any]
     """name, source, steps, on_inversion and on_leave. Of one body also density [kg/m^3], elasticity and plasticity (as
-    `physics.laws.material` takes them), of several `models`, these three of each."""
+    `physics.laws.material` takes them) and `effects` (as `Effects.of` takes them), of several `models`, the first three of each."""
 
 
 def data_root(option: str | os.PathLike | None = None) -> Path:
@@ -107,7 +109,9 @@ def load_scene(name: str | os.PathLike, root: str | os.PathLike | None = None) -
             raise UserError(f"on_leave must be error, clamp or delete, got {on_leave!r}")
         scene = scene_from_dict(content["scene"], content["discretisation"], lambda file, where: named_file(file, where, root, path.parent))
         if one:
-            model = model_from_dict(content["model"])
+            own = mapping(content["model"], "model")
+            effects = _effects(own.pop("effects", None))
+            model = {**model_from_dict(own), "effects": effects}
             body = body_from_dict(content["body"], root, path.parent)
             _check_domain(body, scene)
         else:
@@ -235,6 +239,15 @@ def model_from_dict(model: Mapping[str, Any]) -> dict[str, Any]:
     except UserError as error:
         raise UserError(f"model: {error}") from error
     return {"density": density, "elasticity": elasticity, "plasticity": plasticity}
+
+
+def _effects(given: Any) -> dict[str, float]:
+    """Return the effects beside the laws of a scene file by their names; empty without any."""
+    given = mapping({} if given is None else given, "model.effects")
+    for name in given:
+        if name not in EFFECTS:
+            raise UserError(f"model.effects.{name} is not known{suggest(str(name), EFFECTS) or ';'} choose from {', '.join(EFFECTS)}")
+    return {name: number(value, f"model.effects.{name}", least=0.0) for name, value in given.items()}
 
 
 def scenes_folder() -> Path:

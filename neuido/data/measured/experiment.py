@@ -26,6 +26,9 @@ from neuido.types import Body, Box, Plane, Scene, Solid, Walls
 
 FORMAT = "neuido-experiment/1"
 OVERRIDES = ("gravity", "attached_masses", "colliders")
+ELASTIC = ("fixed_corotated", "sigma", "neo_hookean")
+PLASTIC = ("identity", "von_mises", "drucker_prager")
+"""Laws that may be declared; what else a material does is found as an effect."""
 NEEDED, OPTIONAL = ("x", "t", "x0", "v0", "volume"), ("F0", "track", "anchor")
 
 
@@ -204,6 +207,10 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
             read_text(given[part].get("law"), f"model.{part}.law")
     model = scenes.model_from_dict(given)
     check_density(model["density"])
+    for part, laws in (("elasticity", ELASTIC), ("plasticity", PLASTIC)):
+        if model[part]["law"] not in laws:
+            raise UserError(f"model.{part}.law = {model[part]['law']} is a law of scenes alone; declare {', '.join(laws)} here, and what "
+                            "it lacks is found as an effect")  # fmt: skip
     known = ["density", *(key for part in ("elasticity", "plasticity") for key in model[part] if key != "law")]
     free = read_free(free, tuple(known))
     if effects:

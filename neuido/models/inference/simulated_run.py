@@ -31,7 +31,7 @@ def scene_and_laws(folder: Path) -> tuple[Scene | None, tuple[ElasticLaw, ...]]:
         bodies = content.get("bodies") or [content]
         if not all("model" in each for each in bodies):
             return scene, ()
-        models = [model_from_dict(each["model"]) for each in bodies]
+        models = [model_from_dict({key: value for key, value in each["model"].items() if key != "effects"}) for each in bodies]
         return scene, tuple(material(model["elasticity"], model["plasticity"])[0] for model in models)
 
 

@@ -335,7 +335,9 @@ _FIELDS = {
     for parameter in entry.parameters
     if parameter.field in Effects._fields and entry.only != "track"
 }
-"""The field of `Effects` that each parameter name of `LIBRARY` sets, whole or as its component x, y or z."""
+_FIELDS |= {"rate_yield.index": "yield_index", "compaction_hardening.xi": "compaction_hardening"}
+"""The field of `Effects` that each parameter name of `LIBRARY` sets, whole or as its component x, y or z; and two names that a model may
+declare and no diagnosis proposes."""
 
 
 def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tensor | None) -> dict[str, Any]:

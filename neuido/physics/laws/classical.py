@@ -302,16 +302,32 @@ def stack(laws: Sequence[Law]) -> StackedElastic | StackedPlastic:
     raise UserError(f"stack() takes elastic laws or plastic laws, not both: {names}")
 
 
-_ELASTIC = {"fixed_corotated": (FixedCorotated, ()), "sigma": (Sigma, ()), "neo_hookean": (NeoHookean, ())}
-_PLASTIC = {"identity": (Identity, ()), "von_mises": (VonMises, ("yield_stress",)), "drucker_prager": (DruckerPrager, ("friction_angle",))}
+_OF_YOUNG = ("young", "poisson")
+_ELASTIC = {
+    "fixed_corotated": (FixedCorotated, _OF_YOUNG),
+    "sigma": (Sigma, _OF_YOUNG),
+    "neo_hookean": (NeoHookean, _OF_YOUNG),
+    "mooney_rivlin": (MooneyRivlin, ("c10", "c01", "bulk")),
+    "gent": (Gent, ("shear", "limit", "bulk")),
+    "hyperfoam": (Hyperfoam, ("shear", "exponent", "poisson")),
+    "fluid": (Fluid, ("bulk",)),
+}
+_PLASTIC = {
+    "identity": (Identity, ()),
+    "von_mises": (VonMises, ("yield_stress",)),
+    "drucker_prager": (DruckerPrager, ("friction_angle",)),
+    "volumetric_reset": (VolumetricReset, ()),
+    "snow": (Snow, ("compression", "stretch")),
+}
+_WITH_STIFFNESS = ("von_mises", "drucker_prager")
+"""Plastic laws that need Young's modulus and Poisson's ratio of the elasticity."""
 
 
-def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str, ...]) -> tuple[type, dict[str, Any]]:
+def _named(section: str, given: Mapping[str, Any], laws: dict) -> tuple[type, dict[str, Any]]:
     name = given.get("law")
     if not isinstance(name, str) or name not in laws:
         raise UserError(f"{section}.law = {name!r} is not known{suggest(str(name), laws) or ';'} choose one of {', '.join(laws)}")
-    law, own = laws[name]
-    accepted = (*common, *own)
+    law, accepted = laws[name]
     for key in given:
         if key not in ("law", *accepted):
             raise UserError(f"{section}.{key} is not a key of {name}; it takes {', '.join(('law', *accepted))}")
@@ -322,17 +338,28 @@ def _named(section: str, given: Mapping[str, Any], laws: dict, common: tuple[str
 
 
 def material(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any] | None = None) -> tuple[ElasticLaw, PlasticLaw]:
-    """Create an elastic and a plastic law from the sections of an experiment file.
+    """Create an elastic and a plastic law from the sections of an experiment or scene file.
 
     Args:
-        elasticity: `law` (fixed_corotated, sigma, neo_hookean), `young` [Pa], `poisson`; numbers or tensors (S,).
-        plasticity: `law` (identity, von_mises, drucker_prager) with `yield_stress` [Pa] or `friction_angle` [degrees]. `young` and
-            `poisson` are those of the elasticity. None: identity.
+        elasticity: `law` with its parameters, numbers or tensors (S,): fixed_corotated, sigma or neo_hookean with `young` [Pa] and
+            `poisson`; mooney_rivlin (`c10`, `c01`, `bulk` [Pa]), gent (`shear`, `bulk` [Pa], `limit`), hyperfoam (`shear` [Pa],
+            `exponent`, `poisson`), fluid (`bulk` [Pa]).
+        plasticity: `law`: identity, von_mises with `yield_stress` [Pa], drucker_prager with `friction_angle` [degrees], volumetric_reset,
+            or snow with `compression` and `stretch`. von_mises and drucker_prager take `young` and `poisson` of the elasticity. None:
+            identity.
 
     Raises:
-        UserError: An unknown law, an unknown or missing key, or a parameter out of its range.
+        UserError: An unknown law, an unknown or missing key, a parameter out of its range, or a plastic law without the moduli it needs.
     """
-    law, elastic = _named("elasticity", elasticity, _ELASTIC, ("young", "poisson"))
+    law, elastic = _named("elasticity", elasticity, _ELASTIC)
     pair = law(**elastic)
-    law, own = _named("plasticity", plasticity or {"law": "identity"}, _PLASTIC, ())
-    return pair, law(**own, **elastic) if own else law()
+    plasticity = plasticity or {"law": "identity"}
+    law, own = _named("plasticity", plasticity, _PLASTIC)
+    if plasticity["law"] in _WITH_STIFFNESS:
+        if set(elastic) != set(_OF_YOUNG):
+            raise UserError(
+                f"plasticity.law = {plasticity['law']} needs an elasticity of young and poisson (sigma, fixed_corotated or neo_hookean), "
+                f"not {elasticity['law']}"
+            )
+        own |= elastic
+    return pair, law(**own)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError, one_line, shortened
+from neuido.physics.effects.parameters import Effects
 from neuido.types import ParticleState
 from neuido.viewer.live.live_colliders import LiveColliders
 
@@ -54,13 +55,22 @@ class LawFamily(NamedTuple):
 
     make: Callable[[Mapping[str, float]], tuple[Any, Any]]
     parameters: tuple[Parameter, ...]
+    effects: Effects | None = None
+    """Effects beside the laws; what they remember begins anew with each stretch of the motion."""
 
 
-def classical_family(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any]) -> LawFamily:
-    """Return the family of a classical material with the parameters of a scene file."""
+def classical_family(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any], effects: Mapping[str, float]) -> LawFamily:
+    """Return the family of a classical material with the parameters and the effects of a scene file."""
     from neuido.physics.laws.classical import material
 
-    ranges = {"poisson": ("", 0.0, 0.49, False), "friction_angle": ("degrees", 0.0, 60.0, False)}
+    ranges = {
+        "poisson": ("", 0.0, 0.49, False),
+        "friction_angle": ("degrees", 0.0, 60.0, False),
+        "limit": ("", 0.1, 100.0, True),
+        "exponent": ("", 1.0, 12.0, False),
+        "compression": ("", 0.001, 0.1, True),
+        "stretch": ("", 0.001, 0.1, True),
+    }
     found = []
     for part in (elasticity, plasticity):
         for name, value in part.items():
@@ -71,7 +81,7 @@ def classical_family(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any
     def make(values: Mapping[str, float]) -> tuple[Any, Any]:
         return material(*({key: values.get(key, value) for key, value in part.items()} for part in (elasticity, plasticity)))
 
-    return LawFamily(make, tuple(found))
+    return LawFamily(make, tuple(found), Effects.of(effects) if effects else None)
 
 
 def latent_family(operator: Any, a: Tensor, b: Tensor) -> LawFamily:
@@ -262,7 +272,8 @@ class LiveRun:
             given = tuple(law for law in self.laws if law is not None)
             with self._lock:
                 solids = self.colliders.inputs(count, self.time)
-            frames = self.simulator.rollout(count, *given, state=start, gravity=gravity, solids=solids, every=count)
+            options = {"gravity": gravity, "solids": solids, "effects": self.family.effects}
+            frames = self.simulator.rollout(count, *given, state=start, every=count, **options)
             after = ParticleState(*(part[-1].clone() for part in frames))
         spent = max(time.monotonic() - begun, 1e-6)
         with self._lock:

@@ -10,6 +10,7 @@ from neuido.data.bodies import shapes
 from neuido.data.bodies.particle_volume import body_volume
 from neuido.data.files.parsing import read_yaml
 from neuido.errors import UserError
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material
 from neuido.types import AttachedMass, Box, Plane, Scene, Walls
 
@@ -157,10 +158,36 @@ def test_scene_from_a_file(ball_folder, monkeypatch):
     assert float(body.volume.sum()) == pytest.approx(4 / 3 * np.pi * 0.008, rel=0.1)
 
 
+FLUID = {"density": 1e3, "elasticity": {"law": "fluid", "bulk": 1e5}, "plasticity": {"law": "volumetric_reset"}}
+
+
+def test_a_fluid_with_its_viscosity(ball_folder):
+    root, write = ball_folder
+    info = scenes.load_scene(write(model={**FLUID, "effects": {"viscosity_shear.eta": 2.0}}), root).info
+    assert info["effects"] == {"viscosity_shear.eta": 2.0}
+    elastic, plastic = material(info["elasticity"], info["plasticity"])
+    assert (type(elastic).__name__, type(plastic).__name__) == ("Fluid", "VolumetricReset")
+    assert Effects.of(info["effects"]).viscosity_shear == 2.0
+    assert scenes.load_scene(write(), root).info["effects"] == {}
+
+
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
         ({"colour": "red"}, "colour"),
+        (
+            {"model": {**FLUID, "effects": {"viscosity_shear.nu": 1.0}}},
+            r"viscosity_shear.nu is not known, did you mean 'viscosity_shear.eta'",
+        ),
+        ({"model": {**FLUID, "effects": {"viscosity_shear.eta": -1.0}}}, r"viscosity_shear.eta must be at least 0"),
+        (
+            {"model": {**FLUID, "plasticity": {"law": "von_mises", "yield_stress": 1.0}}},
+            "von_mises needs an elasticity of young and poisson",
+        ),
+        (
+            {"model": {**FLUID, "plasticity": {"law": "snow", "compression": 0.1}}},
+            "plasticity.stretch is missing; snow takes law, compress",
+        ),
         ({"steps": 0}, "steps"),
         ({"on_leave": "ignore"}, "on_leave must be error, clamp or delete"),
         ({"format": "neuido-scene/9"}, "format"),

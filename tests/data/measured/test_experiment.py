@@ -154,6 +154,11 @@ def test_scene_to_dict():
         ("density: 1000.0", f"density: {10**400}", "must be a finite number, got one beyond the range"),
         ("noise: 0.0005", f"noise: {10**400}", "noise must be a finite number"),
         ("law: fixed_corotated", "law: [sigma]", "model.elasticity.law must be text"),
+        (
+            "law: von_mises, yield_stress: 2e3",
+            "law: snow, compression: 0.02, stretch: 0.01",
+            "model.plasticity.law = snow is a law of scenes",
+        ),
     ],
 )
 def test_malformed_yaml(folder, old, new, message):

@@ -233,6 +233,14 @@ def test_stacked_laws_of_all_kinds():
             torch.testing.assert_close(grad[own], engine_adjoint(part, F[own], weights(F)[own])[0])
 
 
+@pytest.mark.parametrize("name", [*ELASTIC, *PLASTIC])
+def test_laws_of_the_sections_of_a_file(name):
+    kind, values = (ELASTIC | PLASTIC)[name]
+    sections = ({"law": name, **values}, None) if name in ELASTIC else ({"law": "fluid", "bulk": BULK}, {"law": name, **values})
+    made = laws.material(*sections)[name in PLASTIC]
+    assert type(made) is kind and repr(made) == repr(law_of(name))
+
+
 @pytest.mark.parametrize(
     ("make", "match"),
     [

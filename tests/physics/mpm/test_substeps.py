@@ -5,7 +5,7 @@ import torch
 
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHookean, Sigma, VonMises, stack
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Fluid, NeoHookean, Sigma, Snow, VolumetricReset, VonMises, stack
 from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
 from neuido.physics.mpm.passes import ClassicalPass, NetworkPass, TransferPass, choose
@@ -85,6 +85,15 @@ def test_transfers_by_warp_are_those_by_particle(plastic):
     assert_agree(run(simulator("transfers", WALLS["separate"], torch.float32), laws), twins, torch.float32)
 
 
+def test_extended_laws_run_between_the_transfers():
+    def laws():
+        bulk = torch.tensor([4e4, 6e4], dtype=torch.float64, requires_grad=True)
+        return Fluid(bulk), VolumetricReset(), [bulk]
+
+    twins = run(simulator("separate", WALLS["separate"], torch.float32), laws)
+    assert_agree(run(simulator("fused", WALLS["separate"], torch.float32), laws), twins, torch.float32)
+
+
 YIELD = {ObjectivePlastic: [3.0, 0.1, 0.0], FullPlastic: [3.0, 0.1, 0.1, 0.5]}
 
 
@@ -149,6 +158,8 @@ def test_what_the_kernels_cannot_do_runs_by_parts():
     assert isinstance(chosen(stack([law, NeoHookean(1e4, 0.3)])), ClassicalPass)
     assert isinstance(chosen(*networks(ObjectiveElastic)()[:2]), NetworkPass)
     assert isinstance(chosen(law, networks(ObjectiveElastic)()[1]), TransferPass)
+    assert isinstance(chosen(stack([law, Fluid(1e4)])), TransferPass)  # laws of the extended kernels
+    assert isinstance(chosen(law, Snow(0.02, 0.01)), TransferPass)
     assert chosen(law, given=STATES + 4) is None  # viscosity
 
 
