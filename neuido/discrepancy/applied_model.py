@@ -10,8 +10,7 @@ from neuido.data.measured.experiment import Recording, read_experiment, write_ex
 from neuido.data.progress import Progress
 from neuido.discrepancy.problems.declared_model import beside, read_model_file, ready
 from neuido.discrepancy.workflow import choose_device, experiment_problem
-from neuido.models.fewshot.scene_fit import EffectSource
-from neuido.models.inference.prepared_scene import PreparedScene
+from neuido.models.inference.prepared_scene import EffectSource, PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.events import Event

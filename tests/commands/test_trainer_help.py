@@ -72,7 +72,7 @@ def test_classes_are_those_that_the_parser_knows():
         "model": "lightning.pytorch.LightningModule",
         "data": "lightning.pytorch.LightningDataModule",
         "method": "neuido.models.fewshot.method.Method",
-        "effects": "neuido.models.fewshot.scene_fit.EffectSource",
+        "effects": "neuido.models.inference.prepared_scene.EffectSource",
     }.items():
         own = resolved(base)
         known = set()

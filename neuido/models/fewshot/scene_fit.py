@@ -9,20 +9,12 @@ from torch import Tensor, nn
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, read_tensors, write_tensors
 from neuido.models.fewshot.relative_density import RelativeDensity
-from neuido.models.inference.prepared_scene import PreparedScene
+from neuido.models.inference.prepared_scene import EffectSource, PreparedScene
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import ParticleState
 
 START, DENSITY = "start.safetensors", "density.safetensors"
-
-
-class EffectSource:
-    """Source of known effects that act in addition to the law of a scene; a configuration names a subclass by `class_path`."""
-
-    def of(self, scene: PreparedScene) -> Effects:
-        """Return the effects for a rollout of the scene, whose time step may be smaller than that of the recording."""
-        raise NotImplementedError
 
 
 class SceneFit(nn.Module):

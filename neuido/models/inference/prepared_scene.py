@@ -14,6 +14,7 @@ from neuido.errors import UserError
 from neuido.models.render.gaussians import Binding, attach_gaussians, bind, load_gaussians
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow import as_bytes, frame_interval_of
+from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
@@ -203,3 +204,11 @@ def frame_substeps(times: Tensor, dt: float, name: str) -> tuple[int, tuple[int,
     if every < 1 or abs(every * dt - interval) > 1e-3 * interval:
         raise UserError(f"{name}: frames are {interval:g} s apart, not a whole number of substeps of {dt:g} s; change dt or frame_step")
     return every, None
+
+
+class EffectSource:
+    """Source of known effects that act in addition to the law of a scene; a configuration names a subclass by `class_path`."""
+
+    def of(self, scene: PreparedScene) -> Effects:
+        """Return the effects for a rollout of the scene, whose time step may be smaller than that of the recording."""
+        raise NotImplementedError

@@ -16,9 +16,9 @@ from neuido.errors import UserError
 from neuido.models.fewshot.fit_progress import Progress, restore
 from neuido.models.fewshot.method import CARD, Method, scalars
 from neuido.models.fewshot.relative_density import RelativeDensity
-from neuido.models.fewshot.scene_fit import DENSITY, EffectSource, SceneFit
+from neuido.models.fewshot.scene_fit import DENSITY, SceneFit
 from neuido.models.inference.pipeline import rollout_with_retries
-from neuido.models.inference.prepared_scene import Laws, PreparedScene, prepare
+from neuido.models.inference.prepared_scene import EffectSource, Laws, PreparedScene, prepare
 from neuido.models.inference.transfer import read_conditions, run_condition
 from neuido.models.scoring import motion_scores as scores
 from neuido.models.stages.image_module import (

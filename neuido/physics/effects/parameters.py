@@ -17,7 +17,6 @@ from neuido.errors import UserError
 from neuido.physics.effects.entry import Entry, Parameter
 from neuido.physics.effects.library import LIBRARY
 from neuido.physics.effects.point_library import FIELD, POINT_ENTRIES
-from neuido.physics.effects.stiffness_fields import as_tensor, ball_inclusion, linear_gradient
 from neuido.types import brief_fields
 
 __all__ = ["LIBRARY", "Effects", "Entry", "Parameter", "ball_inclusion", "linear_gradient"]
@@ -26,48 +25,18 @@ Number = Tensor | float | None
 Triple = Tensor | tuple[float, float, float] | None
 
 _MATERIAL = (
-    "stiffness",
-    "relative_density",
-    "stiffness_change",
-    "maxwell_ratio",
-    "hysteresis",
-    "strain_stiffening",
-    "second_invariant",
-    "tension_compression",
-    "fibre",
-    "yield_inverse",
-    "hardening",
-    "softening",
-    "kinematic_hardening",
-    "rate_yield",
-    "yield_index",
-    "compaction_hardening",
-    "cohesion",
-    "point",
-)
+    "stiffness", "relative_density", "stiffness_change", "maxwell_ratio", "hysteresis", "strain_stiffening", "second_invariant",
+    "tension_compression", "fibre", "yield_inverse", "hardening", "softening", "kinematic_hardening", "rate_yield", "yield_index",
+    "compaction_hardening", "cohesion", "point",
+)  # fmt: skip
 _LOWER_BOUNDS = {
-    "added_mass": (-1.0, ""),
-    "spin_decay": (0.0, " 1/s"),
-    "drag_linear": (0.0, " 1/s"),
-    "drag_quadratic": (0.0, " 1/m"),
-    "viscosity_shear": (0.0, " Pa s"),
-    "viscosity_bulk": (0.0, " Pa s"),
-    "stick": (0.0, " 1/s"),
-    "restitution": (0.0, " 1/s"),
-    "maxwell_ratio": (0.0, ""),
-    "hysteresis": (0.0, ""),
-    "second_invariant": (-1.0, ""),
-    "tension_compression": (-1.0, ""),
-    "fibre": (0.0, " Pa"),
-    "yield_inverse": (0.0, " 1/Pa"),
-    "hardening": (0.0, " Pa"),
-    "softening": (0.0, ""),
-    "kinematic_hardening": (0.0, " Pa"),
-    "rate_yield": (0.0, " Pa s"),
-    "yield_index": (0.1, ""),
-    "compaction_hardening": (0.0, ""),
+    "added_mass": (-1.0, ""), "spin_decay": (0.0, " 1/s"), "drag_linear": (0.0, " 1/s"), "drag_quadratic": (0.0, " 1/m"),
+    "viscosity_shear": (0.0, " Pa s"), "viscosity_bulk": (0.0, " Pa s"), "stick": (0.0, " 1/s"), "restitution": (0.0, " 1/s"),
+    "maxwell_ratio": (0.0, ""), "hysteresis": (0.0, ""), "second_invariant": (-1.0, ""), "tension_compression": (-1.0, ""),
+    "fibre": (0.0, " Pa"), "yield_inverse": (0.0, " 1/Pa"), "hardening": (0.0, " Pa"), "softening": (0.0, ""),
+    "kinematic_hardening": (0.0, " Pa"), "rate_yield": (0.0, " Pa s"), "yield_index": (0.1, ""), "compaction_hardening": (0.0, ""),
     "cohesion": (0.0, " Pa"),
-}
+}  # fmt: skip
 
 
 class Effects(NamedTuple):
@@ -186,7 +155,7 @@ class Effects(NamedTuple):
         value = getattr(self, name)
         if value is None:
             return like.new_zeros(scene_count, width)
-        rows = as_tensor(value).to(like.device, like.dtype)
+        rows = _tensor(value).to(like.device, like.dtype)
         rows = rows.reshape((1, width) if rows.numel() == width else (-1, width))
         if rows.shape[0] not in (1, scene_count):
             raise UserError(f"{name} has {rows.shape[0]} rows for {scene_count} scenes; give one value or one for each scene")
@@ -206,7 +175,7 @@ class Effects(NamedTuple):
         value = (self.point or {}).get(f"{effect}.{part}")
         if value is None:
             return like.new_zeros(scene_count)
-        rows = as_tensor(value).to(like.device, like.dtype).reshape(-1)
+        rows = _tensor(value).to(like.device, like.dtype).reshape(-1)
         if len(rows) not in (1, scene_count):
             raise UserError(f"{effect}.{part} has {len(rows)} values for {scene_count} scenes; give one value or one for each scene")
         p = _POINT[f"{effect}.{part}"]
@@ -230,7 +199,7 @@ class Effects(NamedTuple):
         Raises:
             UserError: Another number of particles, or a factor that is not positive.
         """
-        factor = as_tensor(getattr(self, name)).to(like.device, like.dtype)
+        factor = _tensor(getattr(self, name)).to(like.device, like.dtype)
         if factor.ndim == 0:
             factor = factor.expand(count)
         if factor.shape != (count,):
@@ -259,7 +228,7 @@ class Effects(NamedTuple):
             return total
         if self.time_force_interval is None or not self.time_force_interval > 0:
             raise UserError(f"time_force_interval is {self.time_force_interval}; time_force needs a positive time between its knots")
-        knots = as_tensor(self.time_force).to(gravity)
+        knots = _tensor(self.time_force).to(gravity)
         if knots.ndim not in (2, 3) or knots.shape[-1] != 3 or (knots.ndim == 3 and len(knots) not in (1, count)):
             raise UserError(f"time_force has shape {tuple(knots.shape)}; give (J, 3), or (S, J, 3) for {count} scenes")
         knots = knots.expand(count, *knots.shape[-2:])
@@ -329,6 +298,46 @@ class Effects(NamedTuple):
         return brief_fields(self)
 
 
+def _tensor(value) -> Tensor:
+    """Return a value as a tensor; numbers become float64, to lose no precision."""
+    return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+
+
+def linear_gradient(x: Tensor, slope: Tensor, *, mean: Tensor | None = None, length: Tensor | float | None = None) -> Tensor:
+    """Return the factor exp(slope . (X - mean) / length), (P,): a stiffness gradient across the body.
+
+    Args:
+        x: Reference positions [m], (P, 3).
+        slope: Change of the factor's logarithm over `length` along each axis [-], (3,) or (P, 3).
+        mean: Position at which the factor is one [m]; by default the mean of `x`.
+        length: Reference length [m]; by default the largest extent of `x`.
+    """
+    mean = x.mean(dim=0) if mean is None else mean
+    length = (x.amax(dim=0) - x.amin(dim=0)).max().clamp(min=1e-30) if length is None else length  # one point: a factor of one
+    return torch.exp(((x - mean) / length * slope).sum(-1))
+
+
+def ball_inclusion(
+    x: Tensor, log_ratio: Tensor | float, centre: Tensor, radius: Tensor | float, *, width: Tensor | float = 0.0, mean: Tensor | None = None
+) -> Tensor:
+    """Return the factor exp(log_ratio) inside a ball and 1 outside, (P,): a stiffer or softer inclusion.
+
+    Args:
+        x: Reference positions [m], (P, 3).
+        log_ratio: Logarithm of the factor inside [-], () or (P,).
+        centre: Centre of the ball relative to the mean of `x` [m], (3,) or (P, 3).
+        radius: Radius of the ball [m], () or (P,).
+        width: Width of a smooth border tanh((radius - r) / width) [m]. With 0 the border is sharp, and the factor has no gradient with
+            respect to centre and radius.
+        mean: Replaces the mean of `x`.
+    """
+    r = torch.linalg.vector_norm(x - (x.mean(dim=0) if mean is None else mean) - centre, dim=-1)
+    width = torch.as_tensor(width, dtype=x.dtype, device=x.device)
+    soft = 0.5 + 0.5 * torch.tanh((radius - r) / torch.where(width > 0, width, 1.0))
+    inside = torch.where(width > 0, soft, (r <= radius).to(x.dtype))
+    return torch.exp(log_ratio * inside)
+
+
 _FIELDS = {
     f"{entry.name}.{parameter.name}": parameter.field
     for entry in LIBRARY
@@ -357,7 +366,7 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
             known = ", ".join(_parameter_names(effect)) or "drag_linear.k"
             raise UserError(f"{name} is not a parameter of an effect; use a name of LIBRARY, for example {known}")
         elif name == "time_force.interval":
-            intervals = as_tensor(value).detach().reshape(-1)
+            intervals = _tensor(value).detach().reshape(-1)
             if bool((intervals != intervals[0]).any()):
                 raise UserError(f"time_force.interval is {intervals.tolist()}; all scenes share one, so give one value")
             out["time_force_interval"] = intervals[0].item()
@@ -368,7 +377,7 @@ def _fields(values: Mapping[str, Tensor | float], x: Tensor | None, scene: Tenso
         else:
             out[_FIELDS[name]] = value
     for field, parts in vectors.items():
-        tensors = {key: as_tensor(v).reshape(-1) for key, v in parts.items()}
+        tensors = {key: _tensor(v).reshape(-1) for key, v in parts.items()}
         like = next((t for t in tensors.values() if t.requires_grad), next(iter(tensors.values())))
         size = max(len(t) for t in tensors.values())
         part = {key: t.to(like).expand(size) for key, t in tensors.items()}
@@ -399,7 +408,7 @@ def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tens
     scenes = int(index.max()) + 1
 
     def row(name: str, s: int) -> Tensor:
-        t = as_tensor(part.get(name, 0.0)).to(x).reshape(-1)
+        t = _tensor(part.get(name, 0.0)).to(x).reshape(-1)
         if len(t) not in (1, scenes):
             raise UserError(f"stiffness_gradient.{name} has {len(t)} values for {scenes} scenes; give one, or `scene` of each particle")
         return t[s if len(t) > 1 else 0]

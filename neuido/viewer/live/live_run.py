@@ -59,7 +59,7 @@ class LawFamily(NamedTuple):
     """Effects beside the laws; what they remember begins anew with each stretch of the motion."""
 
 
-def classical_family(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any], effects: Mapping[str, float]) -> LawFamily:
+def classical_family(elasticity: Mapping[str, Any], plasticity: Mapping[str, Any], effects: Mapping[str, float] | None = None) -> LawFamily:
     """Return the family of a classical material with the parameters and the effects of a scene file."""
     from neuido.physics.laws.classical import material
 

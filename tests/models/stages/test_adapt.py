@@ -22,8 +22,8 @@ from neuido.models.fewshot.fit_progress import RATE_RECOVERY, Progress
 from neuido.models.fewshot.low_rank import LowRankAdaptation
 from neuido.models.fewshot.method import Method
 from neuido.models.fewshot.relative_density import RelativeDensity, lattice
-from neuido.models.fewshot.scene_fit import EffectSource, SceneFit
-from neuido.models.inference.prepared_scene import prepare
+from neuido.models.fewshot.scene_fit import SceneFit
+from neuido.models.inference.prepared_scene import EffectSource, prepare
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.stages.adapt import AdaptModule
 from neuido.models.stages.image_module import image_losses
