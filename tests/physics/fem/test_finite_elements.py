@@ -14,7 +14,7 @@ from neuido.physics.fem.assembly import Assembly
 from neuido.physics.fem.assembly_rollout import AssemblyRollout
 from neuido.physics.fem.finite_elements import FiniteElements
 from neuido.physics.fem.meshing import mesh_body
-from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identity, NeoHookean, VonMises, lame
+from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Hyperfoam, Identity, NeoHookean, Snow, VonMises, lame
 from neuido.physics.mpm import reference
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import AttachedMass, Body, Box, ParticleState, Plane, Scene
@@ -198,6 +198,9 @@ CASES = {
     "yielding": ((FixedCorotated(4e4, 0.3), None), {"yield_inverse": 1 / 1.5e3, "hardening": 2e3,
                  "kinematic_hardening": 5e3, "rate_yield": 20.0}),
     "damage": ((FixedCorotated(4e4, 0.3), None), {"softening": 0.5, "second_invariant": 0.2}),
+    "foam": ((Hyperfoam(1.5e4, 4.0, 0.2), None), {}),
+    "thinning": ((FixedCorotated(4e4, 0.3), VonMises(1.5e3, 4e4, 0.3)), {"rate_yield": 20.0, "yield_index": 0.6}),
+    "snow": ((FixedCorotated(4e4, 0.3), Snow(0.02, 0.01)), {"compaction_hardening": 5.0}),
     "drying": ((FixedCorotated(4e4, 0.3), VonMises(1.5e3, 4e4, 0.3)), {"swelling": -3.0, "spin_decay": 20.0}),
 }  # fmt: skip
 
