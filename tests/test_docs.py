@@ -51,6 +51,11 @@ def commands() -> list[tuple[str, str]]:
     return found
 
 
+def skip_without_viewer(code: str) -> None:
+    if re.search(r"neuido\.(show|view)\(|frames\.show\(", code):
+        pytest.importorskip("viser", reason="viser is not installed: pip install neuido[viewer]")
+
+
 def run_page(page: Path, folder: Path) -> str:
     """Run the snippets of a page in their order, beside the YAML files that it shows."""
     for block in blocks(page, "yaml"):
@@ -58,8 +63,7 @@ def run_page(page: Path, folder: Path) -> str:
         assert match, "a YAML block starts with its file name"
         (folder / match[1]).write_text(block)
     code = "\n".join(block for block in blocks(page, "python") if not block.startswith("# needs data"))
-    if re.search(r"\.show\(|neuido\.view\(", code):
-        pytest.importorskip("viser", reason="viser is not installed: pip install neuido[viewer]")
+    skip_without_viewer(code)
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder, env=environment, check=False)
     assert done.returncode == 0, done.stderr
@@ -98,6 +102,7 @@ def test_every_public_name_has_an_example():
 )
 def test_api_example(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    skip_without_viewer(api_examples()[name])
     exec(compile(api_examples()[name], f"example of {name}", "exec"), {})
 
 

@@ -59,7 +59,7 @@ def address_of(server: Any) -> str:
 
 
 def furnish(server: Any, content: Content) -> dict[str, list[Any]]:
-    """Add what stands still: floors, domain, axes, gravity, cameras and lights; set the first view of the camera.
+    """Add the objects that do not move (floors, domain, axes, gravity, cameras, lights) and set the first view of the camera.
 
     Returns:
         The handles of each group, for its check box: `floor`, `domain`, `axes and gravity`, `cameras`.

@@ -105,7 +105,7 @@ BASE = "base"
 
 
 class Place(NamedTuple):
-    """Where a key stands."""
+    """File and line of a key."""
 
     file: Path
     line: int

@@ -4,8 +4,7 @@ The network is fitted to the residual of the fitted recordings and scored on the
 something systematic is left that no candidate describes. The network does not explain it.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -37,8 +36,6 @@ class Ceiling:
     """Share of the held-out data."""
     steps: int
     """Number of training steps of the network."""
-    by_part: Mapping[str, float] = field(default_factory=dict)
-    """Share of each part of the data."""
 
 
 def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
@@ -51,8 +48,8 @@ def of(d: Diagnosis, when: str, *, seed: int = 0) -> Ceiling:
         if not np.isfinite(seen[part.rows]).all():
             return Ceiling(float("nan"), float("nan"), 0)
         features, target, weight = _samples(d, part, seen, d.problem.recordings[n].y - seen, floor.weight[n])
-        rows.append((part.name, part.fitted, features, target, weight, floor.noise[n]))
-    return train([row[1:5] for row in rows], noises=[row[5] for row in rows], names=[row[0] for row in rows], seed=seed)
+        rows.append((part.fitted, features, target, weight, floor.noise[n]))
+    return train([row[:4] for row in rows], noises=[row[4] for row in rows], seed=seed)
 
 
 def as_seen(d: Diagnosis, when: str, n: int) -> np.ndarray:
@@ -108,13 +105,12 @@ def _slope(values: np.ndarray, times: np.ndarray, groups: np.ndarray) -> np.ndar
     return out
 
 
-def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noises: list[float], names: list[str], seed: int = 0) -> Ceiling:
+def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noises: list[float], seed: int = 0) -> Ceiling:
     """Fit a network to the fitted parts of the data, and score it on all parts.
 
     Args:
         parts: For each part whether it is fitted, inputs (n, k), residuals (n, c) and weights (n,), with rows in the order of time.
         noises: Standard deviation of the noise of each part, which no network can explain.
-        names: Names of the parts.
         seed: Seed of the initial weights and of the samples.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -137,18 +133,18 @@ def train(parts: list[tuple[bool, np.ndarray, np.ndarray, np.ndarray]], *, noise
     own, aside = torch.nonzero(~block)[:, 0], torch.nonzero(block)[:, 0]
     own, aside = (i[torch.randperm(len(i), generator=generator)[:ROWS]] for i in (own, aside))
     net, steps = _fit(x, y, w, own, aside, generator)
-    shares = {}
-    for name, (_, f, r, _), noise in zip(names, parts, noises, strict=True):
+    shares = []
+    for (_, f, r, _), noise in zip(parts, noises, strict=True):
         with torch.no_grad():
             left = r - size * net(inputs(f)).double().numpy()
         over = max(float(np.mean(r**2)) - noise**2, 1e-300)
-        shares[name] = min((float(np.mean(r**2)) - float(np.mean(left**2))) / max(over, 1e-3 * float(np.mean(r**2))), 1.0)
+        shares.append(min((float(np.mean(r**2)) - float(np.mean(left**2))) / max(over, 1e-3 * float(np.mean(r**2))), 1.0))
 
     def joined(which: bool) -> float:
-        own = [(len(p[1]), shares[n]) for n, p in zip(names, parts, strict=True) if p[0] == which]
+        own = [(len(p[1]), share) for p, share in zip(parts, shares, strict=True) if p[0] == which]
         return float(np.average([s for _, s in own], weights=[c for c, _ in own])) if own else float("nan")
 
-    return Ceiling(joined(True), joined(False), steps, shares)
+    return Ceiling(joined(True), joined(False), steps)
 
 
 def _block(count: int) -> Tensor:

@@ -88,11 +88,6 @@ def resampling_floor(points: Tensor, seed: int = 0) -> Tensor:
     return chamfer_distance(points[..., order[:half], :], points[..., order[half : 2 * half], :]) * 2 ** (-2 / 3)
 
 
-def matched_rmse(a: Tensor, b: Tensor) -> Tensor:
-    """Return the root mean square distance of corresponding particles over all frames, (..., P, 3) -> ()."""
-    return (a - b).square().sum(-1).mean().sqrt()
-
-
 class ChamferDistance(Metric):
     """Chamfer distance (squared, sum of both directions), mean over frames, times `scale`.
 

@@ -54,7 +54,7 @@ def build(real: type) -> SimpleNamespace:
 
     @func
     def negative_difference(x: real, y: real):
-        """Return (min(ln(1 + y), 0) - min(ln(1 + x), 0)) / (y - x)."""
+        """Return the divided difference of min(ln(1 + x), 0): (min(ln(1 + y), 0) - min(ln(1 + x), 0)) / (y - x)."""
         out = zero
         if x < zero and y < zero:
             out = log_difference(x, y)

@@ -86,7 +86,7 @@ def tetrahedra_of(cells: np.ndarray, kind: int) -> np.ndarray:
     elif kind == 5:
         pattern = np.stack([_five_tetrahedra(parity) for parity in (0, 1)])
     else:
-        raise UserError(f"tetrahedra is {kind}; give 5 or 6")
+        raise UserError(f"tetrahedra must be 5 or 6, got {kind}")
     return pattern[cells.sum(axis=1) % 2] + cells[:, None, None]
 
 

@@ -39,7 +39,7 @@ class LiveColliders:
         return [i for i, solid in enumerate(self.shapes) if solid.mass is None and solid.path is None]
 
     def inputs(self, count: int, begun: float) -> SolidInputs | None:
-        """Return what a chunk of substeps begins with; None without solids.
+        """Return the poses and velocities of the solid colliders for a chunk of substeps; None if there are no solids.
 
         Args:
             count: Number of substeps.

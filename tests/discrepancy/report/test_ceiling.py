@@ -18,7 +18,7 @@ def part(seed: int, *, law: float = 1.0, fitted: bool = True, rows: int = 1500):
 
 
 def shares(parts) -> ceiling.Ceiling:
-    return ceiling.train(parts, noises=[NOISE] * len(parts), names=[str(i) for i in range(len(parts))], seed=1)
+    return ceiling.train(parts, noises=[NOISE] * len(parts), seed=1)
 
 
 def test_lawful_residual_carries_over():
@@ -31,7 +31,7 @@ def test_noise_is_not_explained():
     """In the mean squares themselves: what the network takes off pure noise is little."""
     fitted, features, r, w = part(0, law=0.0)
     other = part(1, law=0.0, fitted=False)
-    found = ceiling.train([(fitted, features, r, w), other], noises=[0.0, 0.0], names=["a", "b"], seed=0)
+    found = ceiling.train([(fitted, features, r, w), other], noises=[0.0, 0.0], seed=0)
     assert found.held_out < 0.05
 
 

@@ -70,7 +70,7 @@ def test_cells_become_conforming_tetrahedra(kind):
 
 
 def test_other_cuts_are_refused():
-    with pytest.raises(UserError, match="tetrahedra is 7"):
+    with pytest.raises(UserError, match="tetrahedra must be 5 or 6, got 7"):
         tetrahedra_of(np.zeros((1, 3), dtype=np.int64), 7)
 
 

@@ -78,7 +78,7 @@ class Matrix:
             return np.zeros(self.shape)
         found, _ = self._numbers(self.rest)
         if len(found) != math.prod(self.shape):
-            raise ValueError(f"an array of the sizes {list(self.shape)[:8]} has {len(found)} values")
+            raise ValueError(f"an array of shape {list(self.shape)[:8]} has {len(found)} values")
         return found.reshape(self.shape, order="F")
 
     def number(self) -> float:
@@ -89,7 +89,7 @@ class Matrix:
         """
         found = self.values()
         if found.size != 1:
-            raise ValueError(f"an array of the sizes {list(self.shape)[:8]} stands where a number should be")
+            raise ValueError(f"expected a number, found an array of shape {list(self.shape)[:8]}")
         return float(found.flat[0])
 
     def parts(self, *names: str) -> list[dict[str, "Matrix"]]:

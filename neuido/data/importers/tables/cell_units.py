@@ -12,7 +12,7 @@ MEASURED = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>[a-zA-Z%‰µμ
 
 
 def with_units_above(rows: list[list[str]], least: int, name: str) -> list[list[str]]:
-    """Return rows whose cells have no units: each block has them in a row of its own, below its titles.
+    """Move the units of cells into a row of their own, below the titles of each block of rows.
 
     Args:
         rows: Rows of a sheet.

@@ -262,7 +262,7 @@ def above_noise(lab: Laboratory, before: np.ndarray, t: Trial) -> float:
 
 
 def by_chance(lab: Laboratory, r: Round) -> float:
-    """Return the gain up to which an effect is not worth another look, alone or with a second one."""
+    """Return the gain that chance alone may bring; an effect that gains less is fitted no further, neither alone nor with a second one."""
     return max(r.by_chance(ALPHA), SOME_GAIN)
 
 

@@ -99,7 +99,7 @@ def _first_loading(test: MaterialTest) -> int:
 def scatter(tests: MaterialTests) -> dict[int, float]:
     """Estimate how much repeats differ: the standard deviation about their mean, in the unit of what was measured, of each of their tests.
 
-    Specimens of one material differ by some percent, and so does a machine from day to day; no effect explains that, and no fit is to.
+    Specimens of one material differ by some percent, and so does a machine from day to day; no effect explains that, and no fit should.
     """
     chained = {i for chain in tests.histories() if len(chain) > 1 for i in chain}
     groups: list[list[int]] = []

@@ -89,12 +89,12 @@ class Guide:
 
 
 class Rolling(Guide):
-    """A point on a plane: the velocity has no part across it.
+    """A point that rolls on a plane: its velocity has no component along the normal.
 
     Args:
         track: The recording.
         sigma: Standard deviation of its noise [m].
-        pull: As of `Guide`.
+        pull: See `Guide`.
         normal: Unit normal of the plane, (3,).
     """
 
