@@ -105,7 +105,7 @@ LIGHT = ("", ".__main__", ".errors", ".data.trajectories.options", ".data.scenes
          *(f".commands.{name}" for name in ("main", "doctor", "reconstruct", "film", "sweep", "report",
                                             "latents", "demo.demo", "output.export",
                                             *(f"simulation.{n}" for n in ("simulate", "trajectories", "scenes", "undeclared", "replay",
-                                                                          "former_options")), "cli.config_files", "cli.abbreviations",
+                                                                          "former_options")), "cli.config_files",
                                             "cli.trainer", "cli.trainer_help", "cli.signatures", "cli.functions")))  # fmt: skip
 
 

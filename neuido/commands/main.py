@@ -20,10 +20,9 @@ from typing import Any
 
 import neuido
 from neuido.commands.cli import interruption
-from neuido.commands.cli.abbreviations import refuse_abbreviations
 from neuido.commands.cli.config_files import find_configs
 from neuido.commands.cli.console import print_oddities
-from neuido.commands.cli.functions import run_function
+from neuido.commands.cli.functions import refuse_abbreviations, run_function
 from neuido.commands.cli.trainer import run_lightning
 from neuido.commands.cli.trainer_help import HEAVY, help_text, wants_help
 from neuido.commands.simulation.former_options import current_command

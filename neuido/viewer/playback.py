@@ -86,7 +86,7 @@ class Playback:
 
     def _first_speed(self) -> str:
         length = float(self.content.times[-1] - self.content.times[0])
-        fitting = [each for each in SPEEDS[:5] if length / _factor(each) >= LEAST_SECONDS]
+        fitting = [each for each in SPEEDS[:5] if length / speed_factor(each) >= LEAST_SECONDS]
         return fitting[-1] if fitting else SPEEDS[0]
 
     def show(self, frame: int, *, told: bool = True) -> None:
@@ -156,7 +156,7 @@ class Playback:
                 continue
             if int(np.searchsorted(times, now, side="right")) - 1 != self.frame:  # someone moved the slider
                 now = float(times[self.frame])
-            now = (now + passed * _factor(str(self.speed.value))) % length
+            now = (now + passed * speed_factor(str(self.speed.value))) % length
             frame = max(int(np.searchsorted(times, now, side="right")) - 1, 0)
             if frame != self.frame:
                 due = time.monotonic() - told > TOLD_SECONDS
@@ -174,7 +174,7 @@ class Playback:
         close_server(self.server)
 
 
-def _factor(speed: str) -> float:
+def speed_factor(speed: str) -> float:
     """Return a speed of `SPEEDS` as a number."""
     over, _, under = speed.partition("/")
     return float(over) / float(under or 1)

@@ -21,6 +21,13 @@ from neuido.errors import UserError, condensed, suggest
 ALWAYS = ("config", "print_config", "help", "c", "h")
 
 
+def refuse_abbreviations() -> None:
+    """Let every parser of jsonargparse take only whole names of options, the parsers of Lightning's commands included."""
+    from jsonargparse import ArgumentParser
+
+    ArgumentParser._get_option_tuples = lambda self, option_string: []  # argparse asks it for the options that begin with a word
+
+
 def run_function(name: str, module: str, function: str, args: list[str]) -> int:
     """Run a function of a module as a command and return its exit status."""
     from jsonargparse import auto_cli

@@ -10,6 +10,7 @@ from neuido.physics.colliders.solid_meshes import mesh_of
 from neuido.viewer.content import PLAIN, Content, Motion, with_scene
 from neuido.viewer.live.live_run import LiveRun, Parameter
 from neuido.viewer.picture import COLLIDER
+from neuido.viewer.playback import speed_factor
 from neuido.viewer.quantities import Quantity, TotalGradients, quantities_of, readable, stress_by_body, stress_of
 from neuido.viewer.world import HOST, PORT, Cloud, address_of, close_server, furnish, legend_html, open_server
 
@@ -79,7 +80,7 @@ class LivePage:
         self.time = gui.add_text("time", "0 s", disabled=True)
         self.error = gui.add_html("", visible=False)
         self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
-        self.speed.on_update(lambda event: setattr(run, "speed", _number(str(self.speed.value))))
+        self.speed.on_update(lambda event: setattr(run, "speed", speed_factor(str(self.speed.value))))
         names = [*self._quantities(), PLAIN]
         self._colour = self._colour if self._colour in names else names[0]
         self.colour = gui.add_dropdown("colour", names, initial_value=self._colour)
@@ -255,11 +256,6 @@ class LivePage:
         """End the simulation and the server."""
         self.run.stop()
         close_server(self.server)
-
-
-def _number(speed: str) -> float:
-    over, _, under = speed.partition("/")
-    return float(over) / float(under or 1)
 
 
 def _name(shape: Any, index: int) -> str:
