@@ -41,7 +41,7 @@ def test_the_other_byte_order_is_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("value", "match"),
-    [(np.array([[1j]]), "complex"), ("word", "class 4"), ({"a": 1.0}, "class 2"), (np.ones((2, 2)), "where a number should be")],
+    [(np.array([[1j]]), "complex"), ("word", "class 4"), ({"a": 1.0}, "class 2"), (np.ones((2, 2)), "expected a number")],
 )
 def test_what_is_no_number_is_refused(tmp_path, value, match):
     savemat(tmp_path / "a.mat", {"a": value})
