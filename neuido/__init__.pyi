@@ -3,6 +3,7 @@ from .data.bodies.scene_files import load_scene
 from .data.importers.importing import import_file
 from .data.measured.experiment import read_experiment
 from .data.measured.material_test import read_material_tests
+from .data.measured.plane_experiment import read_plane_experiment
 from .data.measured.track import read_tracks
 from .data.scenes.readers import read_recording
 from .discrepancy.own_effects import OwnEffect
@@ -72,6 +73,7 @@ __all__ = [
     "read_experiment",
     "read_law",
     "read_material_tests",
+    "read_plane_experiment",
     "read_recording",
     "read_tracks",
     "render",

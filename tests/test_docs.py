@@ -177,6 +177,7 @@ def test_schemas_are_those_of_the_readers():
 
 READERS = {
     "material-test": (neuido.read_material_tests, "test.yaml"),
+    "plane": (neuido.read_plane_experiment, "plane.yaml"),
     "track": (neuido.read_tracks, "track.yaml"),
     "scene": (neuido.load_scene, "scene.yaml"),
 }
@@ -185,13 +186,19 @@ READERS = {
 def example_of(name: str) -> dict:
     """Return the YAML block of a format's page."""
     (block,) = blocks(DOCS / "formats" / f"{name}.md", "yaml")
-    return yaml.safe_load(block.replace("1.0e+6", "1000000.0"))
+    return yaml.safe_load(block.replace("1.0e+6", "1000000.0").replace("2.0e+6", "2000000.0"))
 
 
 def write_folder(name: str, content: dict, folder: Path) -> Path:
     """Write a folder of a format with the tables that its example names."""
     (folder / "uniaxial.csv").write_text("Stretch,Stress\n" + "".join(f"{1 + 0.1 * i},{0.1 * i}\n" for i in range(20)))
     (folder / "golf_1.csv").write_text("t_s,height_m\n" + "".join(f"{0.1 * i},{1.0 + 0.1 * i}\n" for i in range(9)))
+    nodes = [(0, 0, "left", "bottom"), (1, 0, "right", "bottom"), (1, 1, "right", "top"), (0, 1, "left", "top"), (0.5, 0.5, "", "")]
+    (folder / "nodes.csv").write_text("x,y,boundary_x,boundary_y\n" + "".join(f"{x},{y},{a},{b}\n" for x, y, a, b in nodes))
+    (folder / "elements.csv").write_text("node1,node2,node3\n" + "".join(f"{i},{(i + 1) % 4},4\n" for i in range(4)))
+    for i in (1, 2):
+        (folder / f"step_{i}.csv").write_text("ux,uy\n" + "".join(f"{0.01 * i * x},{0.01 * i * y}\n" for x, y, *_ in nodes))
+    (folder / "forces.csv").write_text("right_x,top_y\n80,80\n160,160\n")
     file = folder / READERS[name][1]
     file.write_text(yaml.safe_dump(content))
     return file

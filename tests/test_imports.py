@@ -72,7 +72,7 @@ def test_direction(module):
             assert not wrong, f"{module} imports {sorted(wrong)}; {room} may import {allowed} alone"
 
 
-DIRECT_SOLVER = "neuido.physics.fem.plane_specimen"
+DIRECT_SOLVER = "neuido.physics.plane.plane_specimen"
 """It solves sparse linear systems directly, which neither torch nor NumPy does on a CPU; scipy is a dependency of the package anyway."""
 SPEAK_WANDB = (
     "neuido.commands.main",

@@ -20,13 +20,14 @@ PUBLIC = {
     "neuido": """
         AttachedMass Attachment Body Box Cameras Diagnosis Encoder FiniteElements Frames Gaussians Keyframes Operator OwnEffect
         ParticleState Plane Scene Simulator Skin UserError Walls __version__ colliders configs_root diagnose effects export
-        import_file import_scene laws load_scene rasterize read_experiment read_law read_material_tests read_recording
-        read_tracks render shapes show view
+        import_file import_scene laws load_scene rasterize read_experiment read_law read_material_tests
+        read_plane_experiment read_recording read_tracks render shapes show view
     """,
     "neuido.data": """
-        Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule Recording SceneSetup Track Tracks
+        Experiment FilmDataModule MaterialTest MaterialTests MultiView MultiViewDataModule PlaneExperiment PlaneRecording
+        Recording SceneSetup Track Tracks
         TrajectoryDataModule VisualDataModule bind_skin cameras load_scene mesh_collider read_experiment read_material_tests
-        read_recording read_tracks scene_names shapes write_experiment
+        read_plane_experiment read_recording read_tracks scene_names shapes write_experiment
     """,
     "neuido.models": """
         AdaptModule AlignModule ChamferDistance DynamicsEncoder Encoder FlowVAE FlowVAEModule

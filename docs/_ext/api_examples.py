@@ -234,6 +234,25 @@ from neuido import read_material_tests
 tests = read_material_tests(folder)
 print(tests.tests[0].path[:, 0], tests.tests[0].stress[:, 0])
 """,
+    "read_plane_experiment": """
+from pathlib import Path
+
+from neuido import read_plane_experiment
+
+folder = Path("plate")
+folder.mkdir(exist_ok=True)
+(folder / "nodes.csv").write_text("x,y,boundary_x,boundary_y\\n0,0,left,low\\n1,0,right,low\\n1,1,right,\\n0,1,left,\\n0.5,0.5,,\\n")
+(folder / "elements.csv").write_text("node1,node2,node3\\n0,1,4\\n1,2,4\\n2,3,4\\n3,0,4\\n")
+(folder / "step.csv").write_text("ux,uy\\n0,0\\n0.1,0\\n0.1,-0.03\\n0,-0.03\\n0.05,-0.015\\n")
+(folder / "plane.yaml").write_text('''
+format: neuido-plane/1
+name: plate
+model: {elasticity: {law: neo_hookean, young: 1000000.0, poisson: 0.3}, free: [poisson]}
+specimen: {nodes: nodes.csv, elements: elements.csv, thickness: 0.002, condition: stress}
+recordings: [{name: pull, role: fit, displacements: [step.csv], noise: {displacement: 0.001}}]
+''')
+print(read_plane_experiment(folder).recordings[0].displacement)
+""",
     "read_recording": """
 from neuido import UserError, read_recording
 

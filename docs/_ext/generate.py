@@ -84,6 +84,7 @@ def effect_page() -> str:
     from neuido.data.measured.material_test import EFFECTS as OF_TESTS
     from neuido.data.measured.track import EFFECTS as OF_TRACKS
     from neuido.physics.effects import LIBRARY
+    from neuido.physics.plane.plane_law import EFFECTS as OF_PLANES
 
     fields = kernels()
     parts = [
@@ -99,10 +100,12 @@ def effect_page() -> str:
     ]
     rows = []
     for e in LIBRARY:
-        marks = ["✓" if ok else "" for ok in (not e.only, e.name in OF_TESTS, e.name in OF_TRACKS, not e.only, not e.only)]
+        acts = (not e.only, e.name in OF_TESTS, e.name in OF_PLANES, e.name in OF_TRACKS, not e.only, not e.only)
+        marks = ["✓" if ok else "" for ok in acts]
         alike = ", ".join(e.confusions) + (f"; needs {e.needs}" if e.needs else "")
         rows.append([f"[{e.name}](#{anchor(e.name)})", *marks, alike])
-    head = ["effect", "points or video of a body", "stress and stretch", "track of a point", "MPM", "finite elements", "looks like"]
+    head = ["effect", "points or video of a body", "stress and stretch", "plane specimen", "track of a point", "MPM", "finite elements"]
+    head.append("looks like")
     parts.append(table(head, rows))
     for e in LIBRARY:
         parts += [

@@ -57,6 +57,7 @@ def effects_of(names: Any) -> Schema:
     return {"type": ["object", "null"], "patternProperties": {f"^({pattern})(\\.[A-Za-z0-9_]+)?$": value}, "additionalProperties": False}
 
 
+POISSON: Schema = {"type": "number", "exclusiveMinimum": -1, "exclusiveMaximum": 0.5}
 ELASTICITY = {
     "oneOf": [
         record(
@@ -149,7 +150,7 @@ FREE = {"type": "array", "items": TEXT, "uniqueItems": True}
 def schemas() -> dict[str, Schema]:
     """Return the schema of each format by its file name."""
     from neuido.data.bodies.scene_files import EFFECTS
-    from neuido.data.measured import material_test, track
+    from neuido.data.measured import material_test, plane_experiment, track
     from neuido.data.measured.columns import ROLES
     from neuido.discrepancy.report import diagnosis_format
     from neuido.physics.effects import LIBRARY
@@ -217,6 +218,29 @@ def schemas() -> dict[str, Schema]:
                     )
                 ),
             }
+        ),
+        "neuido-plane-1": record(
+            {
+                "format": one_of(["neuido-plane/1"]),
+                "name": TEXT,
+                "model": record(
+                    {"elasticity": record({"law": one_of(plane_experiment.LAWS), "young": POSITIVE, "poisson": POISSON})},
+                    {"free": FREE, "effects": effects_of(plane_experiment.EFFECTS)},
+                ),
+                "specimen": record(
+                    {"nodes": TEXT, "elements": TEXT, "thickness": POSITIVE, "condition": one_of(plane_experiment.CONDITIONS)}
+                ),
+                "recordings": some(
+                    record(
+                        {"name": TEXT, "role": role, "displacements": some(TEXT)},
+                        {
+                            "forces": {"anyOf": [TEXT, {"type": "null"}]},
+                            "noise": {"oneOf": [{"type": "null"}, record({}, {"displacement": POSITIVE, "force": POSITIVE})]},
+                        },
+                    )
+                ),
+            },
+            {"boundary": {"type": ["object", "null"], "additionalProperties": one_of(plane_experiment.MOTIONS)}},
         ),
         "neuido-track-1": record(
             {

@@ -5,14 +5,14 @@ from pathlib import Path
 
 from neuido.errors import PlausibilityWarning, UserError
 
-KINDS = ("experiment.yaml", "test.yaml", "track.yaml")
+KINDS = ("experiment.yaml", "test.yaml", "track.yaml", "plane.yaml")
 
 
 def check(folder: str) -> None:
     """Read measured data or a recording of images and say whether they are plausible: units, times, markers; views, blur, masks.
 
     Args:
-        folder: A folder with experiment.yaml, test.yaml or track.yaml, or a recording of images.
+        folder: A folder with experiment.yaml, test.yaml, track.yaml or plane.yaml, or a recording of images.
 
     Raises:
         UserError: What is wrong, with the file and the key to change.
@@ -57,7 +57,7 @@ def contents(folder: str) -> list[str]:
     """Return what measured data hold, a line a recording or a test.
 
     Args:
-        folder: A folder with experiment.yaml, test.yaml or track.yaml.
+        folder: A folder with experiment.yaml, test.yaml, track.yaml or plane.yaml.
 
     Raises:
         UserError: What cannot be read, or is not plausible.
@@ -79,6 +79,11 @@ def contents(folder: str) -> list[str]:
 
         found = read_tracks(given)
         kind, entries = "track", found.recordings
+    elif here == "plane.yaml":
+        from neuido.data.measured.plane_experiment import read_plane_experiment
+
+        found = read_plane_experiment(given)
+        kind, entries = "plane specimen", found.recordings
     else:
         raise UserError(f"{folder} has none of {', '.join(KINDS)}: `neuido import` makes such a folder")
     count = f"{len(entries)} recording{'s' * (len(entries) > 1)}"

@@ -37,8 +37,8 @@ def diagnose(
     of each are in OUT/<its name>, and OUT/diagnoses.csv lists all answers. Folders whose answer is there are not diagnosed again.
 
     Args:
-        folder: Measured data: a folder with experiment.yaml, test.yaml or track.yaml, or several such folders. With an engine, an address
-            that fsspec knows (s3://bucket/folder) is one too.
+        folder: Measured data: a folder with experiment.yaml, test.yaml, track.yaml or plane.yaml, or several of them. With an engine,
+            an address that fsspec knows (s3://bucket/folder) is one too.
         out: Folder to write: diagnosis.json, report.html, model_after.yaml, trace.json, log.csv and the predicted motion. Of several
             folders it may be such an address.
         model: File with a model in place of the folder's own, for example an earlier model_after.yaml.

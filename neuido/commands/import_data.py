@@ -24,6 +24,8 @@ def import_data(
     sheet: str | None = None,
     forces: str | None = None,
     region: list[float] | None = None,
+    elements: str | None = None,
+    condition: str | None = None,
     density: float | None = None,
     young: float | None = None,
     poisson: float | None = None,
@@ -85,8 +87,12 @@ def import_data(
         cycles: together: one history. split: each loading and unloading is a test, of the same specimen.
         step: Step of shear that a relaxation modulus belongs to, as 0.01 or "1 %".
         sheet: Of a spreadsheet the only sheet to read.
-        forces: Of a full field, a table with the force at each image.
+        forces: Of a full field, a table with the force at each image. On a mesh, a row a load step with the force on each part of the
+            boundary (right_x, top_y), or with * one file a load step with a row a part.
         region: Of a full field, the part to use: smallest and largest x, smallest and largest y, in the unit of the files.
+        elements: Of a full field on the nodes of a mesh, the table of its triangles or quadrilaterals (node1, node2, node3); a hole or a
+            notch is then no obstacle.
+        condition: Of such a specimen, plane stress (it is thin) or strain (thick, or held between plates).
         density: kg/m^3.
         young: A guess of Young's modulus, in Pa.
         poisson: Poisson's ratio; a material test without it is incompressible.
@@ -169,6 +175,8 @@ def import_data(
             sheet=sheet,
             forces=forces,
             region=region,
+            elements=elements,
+            condition=condition,
             density=density,
             young=young,
             poisson=poisson,

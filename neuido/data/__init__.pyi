@@ -7,6 +7,7 @@ from .clips import FilmDataModule
 from .formats.layout import MultiView
 from .measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from .measured.material_test import MaterialTest, MaterialTests, read_material_tests
+from .measured.plane_experiment import PlaneExperiment, PlaneRecording, read_plane_experiment
 from .measured.track import Track, Tracks, read_tracks
 from .scenes.filmed_scene_module import VisualDataModule
 from .scenes.multiview import MultiViewDataModule
@@ -20,6 +21,8 @@ __all__ = [
     "MaterialTests",
     "MultiView",
     "MultiViewDataModule",
+    "PlaneExperiment",
+    "PlaneRecording",
     "Recording",
     "SceneSetup",
     "Track",
@@ -32,6 +35,7 @@ __all__ = [
     "mesh_collider",
     "read_experiment",
     "read_material_tests",
+    "read_plane_experiment",
     "read_recording",
     "read_tracks",
     "scene_names",

@@ -21,6 +21,7 @@ from neuido.errors import UserError
 if TYPE_CHECKING:
     from neuido.data.measured.experiment import Experiment
     from neuido.data.measured.material_test import MaterialTests
+    from neuido.data.measured.plane_experiment import PlaneExperiment
     from neuido.data.measured.track import Tracks
     from neuido.discrepancy.own_effects import OwnEffect
     from neuido.discrepancy.problems.body import BodyProblem
@@ -34,12 +35,12 @@ EFFORTS = {"quick": 1_000.0, "normal": 10_000.0, "thorough": 100_000.0}
 In thirty blind cases, the 24 searches that were completed simulated each recording 35 to 10,900 times (median 1,200). A simulation cost two
 thirds of one with the declared model.
 """
-KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track"}
+KINDS = {"experiment.yaml": "experiment", "test.yaml": "material test", "track.yaml": "track", "plane.yaml": "plane specimen"}
 
 
 @renamed_arguments(most="max_effects")
 def diagnose(
-    source: "str | os.PathLike | Experiment | MaterialTests | Tracks | Mapping[str, Mapping[str, Any]]",
+    source: "str | os.PathLike | Experiment | MaterialTests | PlaneExperiment | Tracks | Mapping[str, Mapping[str, Any]]",
     *,
     out: str | os.PathLike | None = None,
     model: str | os.PathLike | Mapping[str, Any] | None = None,
@@ -62,8 +63,9 @@ def diagnose(
     """Find the physical effect that a declared model lacks, from measured motion, and add it.
 
     Args:
-        source: Measured data: a folder with experiment.yaml, test.yaml or track.yaml, or what `read_experiment`, `read_material_tests` or
-            `read_tracks` returned, or arrays: of each recording its columns (`arrays.write_arrays` says which), with `model`.
+        source: Measured data: a folder with experiment.yaml, test.yaml, track.yaml or plane.yaml, or what `read_experiment`,
+            `read_material_tests`, `read_tracks` or `read_plane_experiment` returned, or arrays: of each recording its columns
+            (`arrays.write_arrays` says which), with `model`.
         out: Folder for the results. None: a temporary folder, removed with the diagnosis.
         model: Model in place of the folder's own: a file, for example an earlier model_after.yaml, or its content; that of arrays. Not of
             data that are read already.
@@ -88,7 +90,7 @@ def diagnose(
         The diagnosis, read from the folder of results.
 
     Raises:
-        UserError: Data that are in none of the three formats, or an option out of range.
+        UserError: Data that are in none of the formats, or an option out of range.
     """
     begun = time.monotonic()
     if draws < 19:
@@ -194,7 +196,7 @@ def kind_of(folder: str) -> tuple[str, Path]:
     """Return the kind of data in a folder (a value of `KINDS`) and its path.
 
     Raises:
-        UserError: The folder is missing, or it contains none or several of the three files.
+        UserError: The folder is missing, or it contains none or several of the files.
     """
     given = Path(folder).expanduser()
     if given.is_file() and given.name in KINDS:
@@ -203,8 +205,8 @@ def kind_of(folder: str) -> tuple[str, Path]:
         raise UserError(f"folder = {folder}: there is no such folder")
     there = [name for name in KINDS if (given / name).is_file()]
     if len(there) != 1:
-        what = f"both {there[0]} and {there[1]}" if there else "neither experiment.yaml nor test.yaml nor track.yaml"
-        raise UserError(f"folder = {folder} holds {what}: a diagnosis takes one of the three")
+        what = f"both {there[0]} and {there[1]}" if there else f"none of {', '.join(KINDS)}"
+        raise UserError(f"folder = {folder} holds {what}: a diagnosis takes one of them")
     return KINDS[there[0]], given
 
 
@@ -239,6 +241,11 @@ def problems_of(
         from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
         return [MaterialProblem(read_material_tests(folder, model=given))]
+    if kind == "plane specimen":
+        from neuido.data.measured.plane_experiment import read_plane_experiment
+        from neuido.discrepancy.problems.planes.plane_problem import PlaneProblem
+
+        return [PlaneProblem(read_plane_experiment(folder, model=given))]
     from neuido.data.measured.track import read_tracks
     from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, track_problems
 
@@ -256,14 +263,17 @@ def problems_of_data(
     """Return kind and problems of data that are read already: one problem, or one for each body of tracks.
 
     Raises:
-        UserError: The object is none of the three kinds of data, or it does not take an option that is given.
+        UserError: The object is none of the kinds of data, or it does not take an option that is given.
     """
     from neuido.data.measured.experiment import Experiment
     from neuido.data.measured.material_test import MaterialTests
+    from neuido.data.measured.plane_experiment import PlaneExperiment
     from neuido.data.measured.track import Tracks
 
-    if not isinstance(source, Experiment | MaterialTests | Tracks):
-        raise UserError(f"a diagnosis takes a folder, an Experiment, MaterialTests or Tracks, not {type(source).__name__}")
+    if not isinstance(source, Experiment | MaterialTests | PlaneExperiment | Tracks):
+        raise UserError(
+            f"a diagnosis takes a folder, an Experiment, MaterialTests, a PlaneExperiment or Tracks, not {type(source).__name__}"
+        )
     if model is not None:
         raise UserError("model replaces that of a folder: give the folder, or give the model to the function that reads the data")
     if data not in DATA:
@@ -278,6 +288,10 @@ def problems_of_data(
         from neuido.discrepancy.problems.specimens.material import MaterialProblem
 
         return "material test", [MaterialProblem(source)]
+    if isinstance(source, PlaneExperiment):
+        from neuido.discrepancy.problems.planes.plane_problem import PlaneProblem
+
+        return "plane specimen", [PlaneProblem(source)]
     from neuido.discrepancy.problems.tracks.track_problem import track_problems
 
     return "track", track_problems(source)

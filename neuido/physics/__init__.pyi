@@ -1,8 +1,8 @@
 from . import colliders, effects, laws
 from .fem.finite_elements import FiniteElements
 from .fem.meshing import Mesh, mesh_body
-from .fem.plane_specimen import PlaneMotion, PlaneSpecimen
 from .mpm.simulator import Simulator
+from .plane.plane_specimen import PlaneMotion, PlaneSpecimen
 from .runtime.frames import Frames
 from .springs.mass_spring import MassSpring
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 KINDS = ("auto", "material", "track", "body", "field")
 WHAT = {"material": "a material test", "track": "a motion", "body": "points on a deforming body", "field": "a full field",
+        "plane": "a full field on a mesh (--elements)",
         "film": "a video", "outlines": "an outline (--kind body)", "views": "clips of several cameras (--cameras)"}  # fmt: skip
 """What the data of each kind are called in messages."""
 
@@ -51,6 +52,8 @@ def import_file(
     sheet: str | None = None,
     forces: str | None = None,
     region: Sequence[float] | None = None,
+    elements: str | None = None,
+    condition: str | None = None,
     density: float | None = None,
     young: float | None = None,
     poisson: float | None = None,
@@ -113,7 +116,16 @@ def import_file(
         raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
     outlines = films and kind == "body" and filming.cameras is None
     with naming(paths[0]):
-        chosen = "track" if films else _kind(paths[0], columns) if kind == "auto" else kind
+        chosen = (
+            "track"
+            if films
+            else "field"
+            if elements is not None and kind == "auto"
+            else _kind(paths[0], columns)
+            if kind == "auto"
+            else kind
+        )
+    chosen = "plane" if elements is not None and chosen == "field" else chosen
     guided = {key: value for key, value in guide._asdict().items() if value is not None and value != "none"}
     shared = guided.pop("length", None)  # of a specimen too
     dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
@@ -128,14 +140,16 @@ def import_file(
         (("body",), {"volume": volume}),
         (("views", "body", "outlines", "track", "film"), {"floor": floor}),
         (("track", "film"), {"guide": guided.pop("type", None), **guided}),
-        (("material", "field", "outlines", "body"), {"density": density, "young": young, "poisson": poisson}),
+        (("material", "field", "outlines", "body", "plane"), {"density": density, "young": young, "poisson": poisson}),
         (("material",), {"step": step, "sheet": sheet, "compression": compression, "mode": None if mode == "uniaxial" else mode,
                          **(preparation or Preparation()).changed()}),
-        (("material", "field", "outlines"), {"thickness": dimensions.pop("thickness")}),
+        (("material", "field", "outlines", "plane"), {"thickness": dimensions.pop("thickness")}),
         (("material", "field"), dimensions),
         (("track", "film"), {"length": shared}),
-        (("material", "film", "outlines", "views", "track", "body"), {"held_out": held_out or None}),
-        (("field",), {"forces": forces, "region": region}),
+        (("material", "film", "outlines", "views", "track", "body", "plane"), {"held_out": held_out or None}),
+        (("field", "plane"), {"forces": forces}),
+        (("field",), {"region": region}),
+        (("plane",), {"elements": elements, "condition": condition}),
         (("film", "outlines", "views"), filmed),
         (("views", "track", "body"), placed),
         (("views",), several),
@@ -182,7 +196,7 @@ def import_file(
         return {"": in_si(path, motion, units, axes._replace(y_down=False))._replace(scale_error=found.scale_error)}
 
     cameras = filming.cameras is not None and not films
-    said = [f"read as {WHAT[chosen]} (--kind {chosen})"] if kind == "auto" and not films else []
+    said = [f"read as {WHAT[chosen]} (--kind {'field' if chosen == 'plane' else chosen})"] if kind == "auto" and not films else []
     if chosen == "material":
         summary = write_material_tests(
             files_by_name,
@@ -197,6 +211,20 @@ def import_file(
             step=step,
             sheet=sheet,
             material=Material(density, young, poisson),
+        )
+    elif chosen == "plane":
+        from neuido.data.importers.fields.plane_folder import write_plane_folder
+
+        summary = write_plane_folder(
+            files_by_name,
+            out,
+            elements=str(elements),
+            forces=forces,
+            units=units,
+            thickness=None if specimen is None else specimen.thickness,
+            condition=condition,
+            material=Material(density, young, poisson),
+            held_out=held_out,
         )
     elif chosen == "field":
         from neuido.data.importers.fields.field_folder import write_field_test

@@ -17,7 +17,7 @@ VERDICTS = ("named", "class", "lead", "rejected", "weighed")
 It is named; the data cannot tell it from the named one (class); it leads in a search that was cut off; it is rejected for a stated reason;
 or it was compared and explains less (weighed).
 """
-KINDS = ("experiment", "material test", "track")
+KINDS = ("experiment", "material test", "track", "plane specimen")
 Schema = dict[str, Any]
 TEXT: Schema = {"type": "string", "minLength": 1}
 ANY_TEXT: Schema = {"type": "string"}

@@ -37,4 +37,4 @@ class Entry(NamedTuple):
     needs: str = ""
     """What must be measured for it to show, beside what `stage` says."""
     only: str = ""
-    """The one kind of data that can show it, whose model has it: `material test` or `track`. Empty: bodies have it too."""
+    """The one kind of data that can show it, whose model has it: `material test`, `plane specimen` or `track`. Empty: bodies too."""

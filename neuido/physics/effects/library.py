@@ -7,7 +7,7 @@ rejects an explanation whose value lies outside. The confusions were measured in
 from collections.abc import Sequence
 
 from neuido.physics.effects.entry import Entry, Parameter
-from neuido.physics.effects.point_library import POINT_ENTRIES, TRACK_ENTRIES
+from neuido.physics.effects.point_library import PLANE_ENTRIES, POINT_ENTRIES, TRACK_ENTRIES
 
 
 def _vector(field: str, unit: str, size: float, names: Sequence[str] = "xyz") -> tuple[Parameter, ...]:
@@ -304,6 +304,7 @@ LIBRARY = (
         needs="the orientation of a body that rotates; the track of one point has none",
     ),
     *POINT_ENTRIES,
+    *PLANE_ENTRIES,
     *TRACK_ENTRIES,
 )
 """One entry for each effect, grouped by kind."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from neuido.errors import UserError
 from neuido.physics.effects.entry import Entry, Parameter
 from neuido.physics.effects.library import LIBRARY
-from neuido.physics.effects.point_library import FIELD, POINT_ENTRIES
+from neuido.physics.effects.point_library import FIELD, PLANE_ENTRIES, POINT_ENTRIES
 from neuido.types import brief_fields
 
 __all__ = ["LIBRARY", "Effects", "Entry", "Parameter", "ball_inclusion", "linear_gradient"]
@@ -424,7 +424,7 @@ def _stiffness(part: Mapping[str, Tensor | float], x: Tensor | None, scene: Tens
     return factor
 
 
-_POINT = {f"{entry.name}.{p.name}": p for entry in POINT_ENTRIES for p in entry.parameters}
+_POINT = {f"{entry.name}.{p.name}": p for entry in (*POINT_ENTRIES, *PLANE_ENTRIES) for p in entry.parameters}
 _NAMES = {f"{entry.name}.{parameter.name}" for entry in LIBRARY for parameter in entry.parameters}
 
 

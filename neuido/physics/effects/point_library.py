@@ -1,4 +1,4 @@
-"""Entries of the library for the effects that laboratories see in material tests, and in tracks of points.
+"""Entries of the library for the effects that laboratories see in material tests, in plane specimens, and in tracks of points.
 
 Two of those of tests, sums of Maxwell branches, act in bodies too. Rollouts of bodies refuse the others. The ranges are those of soft
 and hard materials alike.
@@ -12,10 +12,10 @@ BODIES_TOO = ("relaxation_spectrum", "fractional")
 """Effects of this module that rollouts of bodies have too."""
 
 
-def _entry(name: str, title: str, equation: str, *parameters: tuple[str, str, float, float], **more) -> Entry:
+def _entry(name: str, title: str, equation: str, *parameters: tuple[str, str, float, float], only: str = "material test", **more) -> Entry:
     """Return an entry from parameters (name, unit, low, high)."""
     made = tuple(Parameter(key, FIELD, unit, low, high, low < 0) for key, unit, low, high in parameters)
-    return Entry(name, title, equation, made, only="" if name in BODIES_TOO else "material test", **more)
+    return Entry(name, title, equation, made, only="" if name in BODIES_TOO else only, **more)
 
 
 POINT_ENTRIES = (
@@ -184,6 +184,32 @@ POINT_ENTRIES = (
 """One entry for each effect."""
 FLUID = ("power_law", "carreau", "bingham", "herschel_bulkley", "thixotropy")
 """Effects of a declared fluid in steady or changing shear; a solid has none of them, and a fluid no others."""
+
+PLANE_ENTRIES = (
+    _entry(
+        "volumetric",
+        "another dependence on the volume",
+        "W = (1 - share) W(mu/2 (I1 - 3) - mu ln J + lambda/2 (ln J)^2) + share W(mu/2 (I1bar - 3) + K/2 (J - 1)^2), or the reverse",
+        ("share", "1", -1.0, 3.0),
+        only="plane specimen",
+        stage="internal modes",
+        confusions=("strain_stiffening", "second_invariant", "geometric_nonlinearity"),
+        source="Holzapfel, Nonlinear Solid Mechanics, 2000, 6.4 and 6.5; of other laws lambda/2 (ln J)^2 against lambda/2 (J - 1)^2",
+        needs="a volume that changes by some per cent",
+    ),
+    _entry(
+        "geometric_nonlinearity",
+        "large deformation (geometric nonlinearity)",
+        "W = (1 - share) W(small strain) + share W(mu/2 (I1bar - 3) + K/2 (J - 1)^2)",
+        ("share", "1", 0.0, 1.0),
+        only="plane specimen",
+        stage="internal modes",
+        confusions=("volumetric", "strain_stiffening", "second_invariant"),
+        source="Bonet and Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2008",
+        needs="a declared linear elasticity, and strains of some per cent",
+    ),
+)
+"""Effects of a plane specimen beside those that bodies have too."""
 
 TRACK_ENTRIES = (
     Entry(

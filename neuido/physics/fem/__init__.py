@@ -1,4 +1,4 @@
-"""Finite elements: explicit ones of moving bodies, and quasi-static ones of flat specimens."""
+"""Explicit finite elements of moving bodies."""
 
 import lazy_loader
 

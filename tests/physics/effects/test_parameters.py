@@ -364,6 +364,7 @@ def test_the_library_has_the_vocabulary():
         stiffness_gradient stiffness_change friction stick restitution cohesion added_mass swelling spin_decay
         relaxation_spectrum fractional mullins permanent_set compaction creep nonlinear_backstress cyclic_hardening rate_power
         power_law carreau bingham herschel_bulkley thixotropy
+        volumetric geometric_nonlinearity
         dry_friction local_force lift buoyancy bounce_friction bounce_speed
     """.split()
     assert sorted(entry.name for entry in LIBRARY) == sorted(names)

@@ -116,7 +116,7 @@ def _check_uniform(field: Field, gradient: np.ndarray, axis: int) -> None:
     if left > UNIFORM * elongation:
         raise UserError(
             f"the strain is not uniform: displacements differ from it by {left / elongation:.0%} of the elongation, more than "
-            f"{UNIFORM:.0%}; fields with gradients (a hole, a notch) cannot be fitted yet: choose a uniform part of the specimen (--region)"
+            f"{UNIFORM:.0%}; for gradients (a hole, a notch) give the mesh (--elements), or choose a uniform part (--region)"
         )
     strain = (gradient + gradient.T) / 2 - np.eye(2)
     shear = abs(strain[0, 1] / strain[axis, axis])

@@ -133,6 +133,8 @@ def would_help(kind: str, *, discretised: bool) -> list[str]:
     out = ["a longer or faster recording of the same body", "a recording of another launch, fitted beside these"]
     if kind == "material test":
         out = ["tests to larger strain, in another mode, or at another rate", "a repeated test, which gives the scatter of the specimens"]
+    if kind == "plane specimen":
+        out = ["load steps of larger strain", "forces that are known better than within one per cent", "less noise in the displacements"]
     if discretised:
         out = ["a finer grid and a smaller time step in the scene", *out, "more views or more tracked points"]
     return out

@@ -8,9 +8,9 @@ import torch
 
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.fem.plane_specimen import PlaneSpecimen
 from neuido.physics.laws.base import AutogradElastic
 from neuido.physics.laws.classical import NeoHookean, Sigma
+from neuido.physics.plane.plane_specimen import PlaneSpecimen
 from neuido.physics.points.material_point import Specimen, stress_along
 
 Law = AutogradElastic | NeoHookean | Sigma

@@ -1,0 +1,1 @@
+"""Plane specimens as a problem: predictions by quasi-static finite elements, candidates, and noise."""
