@@ -121,6 +121,8 @@ def recordings_of(problem: Problem) -> dict[str, dict[str, Any]]:
         elif hasattr(own, "measured"):
             scene = own.measured[n].scene
             made |= {"gravity": [float(g) for g in scene.gravity], "colliders": [_plane(p) for p in scene.colliders]}
+        elif hasattr(own, "pictured"):
+            made |= {"quantity": "displacement", "parts": [part.name for part in own.experiment.boundary]}
         elif hasattr(own, "axes"):
             made |= {"quantity": "position", "timed": True, "channels": [COMPONENTS[a] for a in own.axes]}
         out[recording.name] = made
@@ -371,7 +373,8 @@ def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, s
 
     Tracked bodies have `positions` (1), `t` (T,) [s], and `measured`, `before` and `after` (T, N, 3) [m]. Predictions include the most
     probable nuisances and the other settings in their amounts; `before_model` and `after_model` are without them. Other data are vectors
-    (n,) with `times`, `groups` (channel of each value) and, of a material test, `axis` (stretch or shear).
+    (n,) with `times`, `groups` (channel of each value) and, of a material test, `axis` (stretch or shear). Plane specimens have the arrays
+    of `PlaneProblem.pictured` too.
     """
     out: dict[str, dict[str, np.ndarray]] = {}
     failed: dict[str, str] = {}
@@ -382,6 +385,8 @@ def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, s
             over = abscissa(problem, n)
             out[recording.name] = {"times": recording.times, "groups": recording.groups, "measured": recording.y, **own}
             out[recording.name] |= {} if over is None else {"axis": over}
+            if hasattr(inner(problem), "pictured"):
+                out[recording.name] |= inner(problem).pictured({"before": d.before, "after": d.after}, n)
             continue
         r = problem.measured[n]
         arrays = {"positions": np.array(1), "t": r.t.numpy(), "measured": r.x.double().numpy()}

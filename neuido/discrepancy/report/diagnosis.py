@@ -262,7 +262,9 @@ class Diagnosis:
         units = Units.of([own._content for own in self.bodies.values()])
         for i, (name, own, arrays) in enumerate(shown):
             ax = figure.add_subplot(1, len(shown), i + 1)
-            if "positions" in arrays:
+            if "nodes" in arrays:
+                _field(ax, arrays, own._content, units)
+            elif "positions" in arrays:
                 _curves(ax, arrays, own.error, units)
             else:
                 _data(ax, arrays, own._content, name, units)
@@ -306,6 +308,20 @@ def _figure(q: Quantity) -> str:
         return f"({', '.join(f'{v:.3g}' for v in q.value)}) {q.unit}"
     low, high = ("infinite" if end is None else f"{end:.3g}" for end in q.interval)
     return f"{q.value:.3g}{'' if q.unit == '1' else f' {q.unit}'} (90 %: {low} to {high})"
+
+
+def _field(ax: Any, arrays: Mapping[str, Any], content: Mapping[str, Any], units: Units) -> None:
+    """Draw the size of the residual of a plane specimen at the last load step, with the effects where some are named."""
+    import numpy as np
+
+    when = "after" if content["effects"] else "before"
+    factor, unit = units.scaled("m")
+    place = factor * (arrays["nodes"] + arrays[f"moved_{when}"][-1])
+    size = factor * np.linalg.norm((arrays["moved_measured"] - arrays[f"moved_{when}"])[-1], axis=1)
+    shown = ax.tripcolor(*place.T, np.nan_to_num(size), triangles=arrays["triangles"], shading="gouraud")
+    ax.set(aspect="equal", xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
+    ax.plot([], [], label=f"residual {when}")
+    ax.figure.colorbar(shown, ax=ax, label=f"residual [{unit}]")
 
 
 def _curves(ax: Any, arrays: Mapping[str, Any], error: ErrorChange, units: Units) -> None:

@@ -89,6 +89,7 @@ def schema() -> Schema:
             "axis": AXIS,
             "timed": {"type": "boolean"},
             "channels": listing(TEXT),
+            "parts": listing(TEXT),
             "mode": TEXT,
             "gravity": VECTOR,
             "colliders": listing(PLANE),

@@ -156,6 +156,9 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
         add("Error over time", [plots.error_over_time(name, arrays, c, units, rows) for name, arrays in bodies.items()])
         add("Where on the body", [motion_player.residual_map(bodies, c, units)], form="map", note=_places(c, units))
         add("Which stage", plots.stage_plots(c), note=WEAK)
+    elif any("nodes" in arrays for arrays in motion.values()):
+        add("The specimen before and after", [p for name, arrays in others.items() for p in plots.specimen_plots(name, arrays, c, units)],
+            note=FIELD)  # fmt: skip
     elif any("masks" in arrays for arrays in motion.values()):
         from neuido.discrepancy.report import silhouette_pictures  # loads torch, which no other page needs
 
@@ -185,6 +188,7 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
     )
 
 
+FIELD = "Colours and arrows show measured minus predicted displacements; in a recording the largest arrow is a twelfth of the specimen."
 WEAK = "What is missing, by the weak residual, which differentiates no measured position; grey: what noise alone makes of it."
 SIZES = "The size that each other effect is smaller than with a probability of 90 %, to first order, given the fitted recordings."
 

@@ -143,6 +143,52 @@ def _is_scattered(x: np.ndarray) -> bool:
     return float(np.median(np.abs(np.diff(x)))) > 0.2 * float(np.ptp(x))
 
 
+ARROW = 0.08
+"""Length of the arrow of the largest residual relative to the extent of the specimen."""
+
+
+def specimen_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units) -> list[Plot]:
+    """Return plots of a plane specimen: the residual of its nodes at the last load step on the mesh, and the forces over the load steps.
+
+    Args:
+        name: Name of the recording.
+        arrays: Its arrays, of `PlaneProblem.pictured`.
+        c: Part of diagnosis.json.
+        units: Units of the page.
+    """
+    factor, unit = units.scaled("m")
+    nodes, t = arrays["nodes"], arrays["triangles"]
+    edges = np.unique(np.sort(np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]], axis=0), axis=1), axis=0)
+    left = {when: factor * (arrays["moved_measured"] - arrays[f"moved_{when}"])[-1] for when, _ in predictions(c)}
+    top = max(float(np.nanmax(np.linalg.norm(r, axis=1), initial=0.0)) for r in left.values())
+    out = []
+    for when, called in predictions(c):
+        place = factor * (nodes + arrays[f"moved_{when}"][-1])
+        if not np.isfinite(place).all():
+            continue
+        size = np.linalg.norm(left[when], axis=1)
+        tips = place + ARROW * factor * float(np.ptp(nodes, axis=0).max()) / max(top, 1e-300) * left[when]
+        data = []
+        for label, ends, role in (("mesh", [place[edges[:, 0]], place[edges[:, 1]]], "faint"), ("residual", [place, tips], when)):
+            gap = np.full_like(ends[0], np.nan)
+            data.append(line(label, *np.stack([*ends, gap], 1).reshape(-1, 2).T, role, width=0.5 if label == "mesh" else 1.2))
+        marker = {"color": numbers(size, 3), "colorscale": "Viridis", "cmin": 0.0, "cmax": top, "size": 5, "showscale": True}
+        spots = dots(
+            f"residual [{unit}]", *place.T, when, showlegend=False, hovertemplate="%{marker.color:.3g} " + unit + "<extra></extra>"
+        )
+        data.append(spots | {"marker": marker | {"colorbar": {"title": {"text": f"residual [{unit}]"}}}})
+        square = {"yaxis": {"scaleanchor": "x"}}
+        out.append(plot(f"{heading(name, c)}: {called}, last load step", f"x [{unit}]", f"y [{unit}]", data, **square))
+    steps = np.arange(1, len(arrays["force_measured"]) + 1)
+    curves: list[Plot] = []
+    for i, part in enumerate(c["recordings"].get(name, {}).get("parts", [])):
+        if np.isfinite(arrays["force_measured"][:, i]).any():
+            curves.append(dots(f"{part}, measured", steps, arrays["force_measured"][:, i], "measured", size=7))
+            look = ("solid", "dash", "dot", "dashdot")[i % 4]
+            curves += [line(f"{part}, {called}", steps, arrays[f"force_{when}"][:, i], when, dash=look) for when, called in predictions(c)]
+    return out + ([plot(f"{heading(name, c)}: forces", "load step", "force [N]", curves)] if curves else [])
+
+
 def stage_plots(c: Mapping[str, Any]) -> list[Plot]:
     """Return a plot of the missing quantity over time for each stage of each recording, before, after and by noise alone."""
     out = []

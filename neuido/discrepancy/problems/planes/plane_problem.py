@@ -1,6 +1,6 @@
 """A plane specimen as a `Problem`: displacements of the free nodes and reaction forces under the measured motion of the boundary."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -181,6 +181,25 @@ class PlaneProblem(Problem):
             "displacement": np.stack([s.displacement.numpy() for s in found]),
             "force": np.stack([self.forces_of(s.force.numpy()) for s in found]),
         }
+
+    def pictured(self, points: Mapping[str, Point], recording: int) -> dict[str, np.ndarray]:
+        """Return what pictures of a recording show: the mesh, and measured and predicted displacements and forces.
+
+        Args:
+            points: Parameter sets by name, `before` and `after`.
+            recording: Number of the recording.
+
+        Returns:
+            `nodes` (N, 2) [m], `triangles` (E, 3), `moved_measured` (T, N, 2) [m], `force_measured` (T, B) [N], and for each parameter set
+            `moved_<name>` and `force_<name>`.
+        """
+        own = self.experiment.recordings[recording]
+        out = {"nodes": self.experiment.specimen.nodes.numpy(), "triangles": self.experiment.specimen.triangles.numpy()}
+        out |= {"moved_measured": own.displacement, "force_measured": own.force}
+        for name, point in points.items():
+            found = self.fields(point, recording)
+            out |= {f"moved_{name}": found["displacement"], f"force_{name}": found["force"]}
+        return out
 
     def effort(self, recording: int, setting: int = 0) -> float:
         return float(len(self.experiment.specimen.triangles) * len(self._steps[recording]))
