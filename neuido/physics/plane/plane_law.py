@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError, suggest
-from neuido.physics.effects.parameters import Effects, linear_gradient
 from neuido.physics.laws.base import ElasticLaw
 from neuido.physics.laws.classical_kernels import LOCKED
 from neuido.physics.laws.parametric import lame
@@ -80,7 +79,16 @@ ENERGIES: dict[str, Callable[[Five, Moduli], Tensor]] = {
     "sigma": sigma,
 }  # fmt: skip
 """Energy of each elastic law that a plane specimen may declare."""
-EFFECTS = ("volumetric", "geometric_nonlinearity", "strain_stiffening", "second_invariant", "fibre", "stiffness_gradient")
+PARAMETERS = {
+    "volumetric": ("share",),
+    "geometric_nonlinearity": ("share",),
+    "strain_stiffening": ("k",),
+    "second_invariant": ("c",),
+    "fibre": ("c", "azimuth", "elevation"),
+    "stiffness_gradient": ("x", "y"),
+}
+"""Parameters of the effects of the library that act in a plane specimen."""
+EFFECTS = tuple(PARAMETERS)
 """Effects of the library that a plane specimen shows."""
 LARGE = "decoupled_neo_hookean"
 """Law that `geometric_nonlinearity` leads to, with the same moduli."""
@@ -109,10 +117,11 @@ class PlaneLaw:
         self.moduli = Moduli(*lame(young, poisson))
         self._values = {key: torch.as_tensor(value, dtype=torch.float64).reshape(()) for key, value in (effects or {}).items()}
         for key in self._values:
-            if key.partition(".")[0] not in EFFECTS:
+            effect, _, part = key.partition(".")
+            if effect not in EFFECTS:
                 raise UserError(f"{key} is no effect of a plane specimen: choose from {', '.join(EFFECTS)}")
-        flat = {key: value for key, value in self._values.items() if not key.startswith("stiffness_gradient")}
-        Effects.of(flat)  # refuses a name that is none
+            if part not in PARAMETERS[effect]:
+                raise UserError(f"{key} is not a parameter of {effect} in the plane, which has {', '.join(PARAMETERS[effect])}")
         self._named = {key.partition(".")[0] for key in self._values}
         self._differentiable = any(t.requires_grad for t in (young, poisson, *self._values.values()))
         self._factor = None
@@ -120,7 +129,8 @@ class PlaneLaw:
             if centres is None:
                 raise UserError("stiffness_gradient needs the centres of the triangles")
             slope = torch.stack([self._value("stiffness_gradient", a) for a in "xy"])
-            self._factor = linear_gradient(centres, slope)
+            extent = (centres.amax(0) - centres.amin(0)).max()
+            self._factor = torch.exp((centres - centres.mean(0)) @ slope / extent)  # as `effects.linear_gradient`
 
     def _value(self, effect: str, part: str) -> Tensor:
         return self._values.get(f"{effect}.{part}", torch.zeros((), dtype=torch.float64))

@@ -7,9 +7,9 @@ import torch
 
 from neuido.errors import UserError
 from neuido.physics.effects.constitutive import Constitutive
-from neuido.physics.effects.parameters import Effects
+from neuido.physics.effects.parameters import LIBRARY, Effects, linear_gradient
 from neuido.physics.laws.classical import material
-from neuido.physics.plane.plane_law import EFFECTS, PlaneLaw, SpatialLaw
+from neuido.physics.plane.plane_law import EFFECTS, PARAMETERS, PlaneLaw, SpatialLaw
 from tests.physics.plane.test_plane_specimen import pulled, sheet
 
 LAW = {"law": "neo_hookean", "young": 2.7, "poisson": 0.35}
@@ -44,6 +44,16 @@ def test_the_energy_is_that_of_three_dimensions(law, effect):
     F, effects = gradients(), PRESENT.get(effect, {})
     other = SpatialLaw(Whole(LAW | {"law": law}, effects, len(F))).stress(F)
     torch.testing.assert_close(PlaneLaw(LAW | {"law": law}, effects).stress(F).detach(), other.detach(), atol=1e-11, rtol=1e-9)
+
+
+def test_parameters_and_gradient_are_those_of_the_library():
+    known = {entry.name: [p.name for p in entry.parameters] for entry in LIBRARY}
+    assert all(set(own) <= set(known[name]) for name, own in PARAMETERS.items())
+    own = sheet(2)
+    flat = torch.cat([own.centres, torch.zeros(len(own.centres), 1)], 1)
+    F = torch.tensor([1.0, 0, 0, 1, 1]) + 0.1 * gradients(len(flat))
+    plain, graded = (PlaneLaw(LAW, more, centres=own.centres).stress(F) for more in ({}, PRESENT["stiffness_gradient"]))
+    torch.testing.assert_close(graded, plain * linear_gradient(flat, torch.tensor([0.5, -0.3, 0.0]))[:, None])
 
 
 def test_beyond_the_locking_the_stress_goes_on():
@@ -101,7 +111,7 @@ def test_the_stiffness_of_another_law_serves():
         ({"young": -1.0}, {}, "young = -1 must be positive"),
         ({"poisson": 0.5}, {}, "poisson = 0.5 between"),
         ({}, {"drag_linear.k": 1.0}, "drag_linear.k is no effect of a plane specimen"),
-        ({}, {"volumetric.shares": 1.0}, "volumetric.shares is not a parameter"),
+        ({}, {"volumetric.shares": 1.0}, "volumetric.shares is not a parameter of volumetric"),
         ({}, {"stiffness_gradient.x": 1.0}, "needs the centres"),
     ],
 )
