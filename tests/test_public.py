@@ -102,6 +102,14 @@ def test_import_and_listing_load_no_torch():
     assert answer.stdout.split() == [neuido.__version__, "False"]
 
 
+def test_export_is_a_function_beside_the_folder_of_that_name():
+    import_module("neuido.export.exporting")
+    from neuido import export
+
+    assert callable(export) and neuido.export is export
+
+
+@pytest.mark.slow
 def test_export_is_a_function_whatever_was_imported_first():
     code = "import neuido.export.exporting, neuido; from neuido import export; print(callable(neuido.export), callable(export))"
     code += "; import neuido.export.series; print(neuido.export is export)"
