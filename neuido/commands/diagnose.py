@@ -64,7 +64,7 @@ def diagnose(
         Exit status: 1 where one of several folders could not be diagnosed.
 
     Raises:
-        UserError: The folder is no measured data in one of the three formats, or an option is out of range.
+        UserError: The folder is no measured data in one of the formats, or an option is out of range.
     """
     options = {
         "model": model,

@@ -159,7 +159,7 @@ def test_many_folders_by_the_command(tmp_path, capsys):
         ("throw", "effect", "drag_quadratic"),
         ("empty", "failed", ""),
     ]
-    assert "neither experiment.yaml" in rows[1]["error"] and (tmp_path / "out" / "throw" / "report.html").is_file()
+    assert "none of experiment.yaml" in rows[1]["error"] and (tmp_path / "out" / "throw" / "report.html").is_file()
 
 
 @pytest.mark.slow

@@ -123,6 +123,8 @@ class PlaneLaw:
             if part not in PARAMETERS[effect]:
                 raise UserError(f"{key} is not a parameter of {effect} in the plane, which has {', '.join(PARAMETERS[effect])}")
         self._named = {key.partition(".")[0] for key in self._values}
+        self.turns = name == "linear" and self._named <= {"fibre", "stiffness_gradient"}
+        """Whether the energy stays finite where a triangle turns inside out, as in small-strain elasticity at large strain."""
         self._differentiable = any(t.requires_grad for t in (young, poisson, *self._values.values()))
         self._factor = None
         if "stiffness_gradient" in self._named:
@@ -199,6 +201,8 @@ class SpatialLaw:
     Args:
         law: The law, for one scene.
     """
+
+    turns = False
 
     def __init__(self, law: ElasticLaw) -> None:
         self.law = law

@@ -196,7 +196,7 @@ class PlaneSpecimen:
             move = move.reshape(-1, 2)
             for _ in range(HALVINGS):
                 F = self._detached_gradient(u + move)
-                if bool((_area_ratio(F) > 0).all()):
+                if law.turns or bool((_area_ratio(F) > 0).all()):
                     break
                 move = 0.5 * move  # until it turns no triangle inside out
             u = u + move
@@ -225,7 +225,7 @@ class PlaneSpecimen:
                 return None
             move[free] = -factor.solve(right[free])
             u = u + move.reshape(-1, 2)
-            if not bool(torch.isfinite(u).all()) or bool((_area_ratio(self.gradient(u)) <= 0).any()):
+            if not bool(torch.isfinite(u).all()) or (not law.turns and bool((_area_ratio(self.gradient(u)) <= 0).any())):
                 return None
         return None
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import neuido
+from neuido.data.importers.machines.testing_machine import Specimen
 from neuido.data.measured.plane_experiment import read_plane_experiment
 from neuido.discrepancy.problems.planes.plane_noise import displacement_noise
 from neuido.discrepancy.problems.planes.plane_problem import PlaneProblem
@@ -103,3 +104,25 @@ def test_the_right_answer(case, noise, tmp_path):
     assert found.answer == ("none" if name is None else "effect")
     assert [effect.name for effect in found.effects] == ([] if name is None else [name])
     assert found.error.after < 1.5 * noise
+
+
+@pytest.mark.slow
+def test_the_shared_plate_from_its_raw_tables(data_root, tmp_path):
+    """The import reproduces the tables to rounding, and the law that is known leaves nothing."""
+    folder = data_root / "measured" / "plate-known-truth"
+    if not folder.is_dir():
+        pytest.skip("no plate")
+    files = [str(folder / f"nodes_{n}.csv") for n in (10, 20, 30, 40)]
+    options = {"elements": str(folder / "elements.csv"), "forces": str(folder / "reactions_*.csv"), "condition": "strain"}
+    options |= {"units": {"displacement": "m", "force": "N"}, "specimen": Specimen(None, None, "1 m", None, None), "poisson": 0.35}
+    neuido.import_file(files, tmp_path / "plate", **options)
+    model = {"elasticity": {"law": "decoupled_neo_hookean", "young": 2.7, "poisson": 0.35}, "free": FREE}
+    own = read_plane_experiment(tmp_path / "plate", model=model)
+    raw = np.genfromtxt(files[3], delimiter=",", names=True)
+    np.testing.assert_array_equal(own.recordings[1].displacement[1], np.stack([raw["ux"], raw["uy"]], 1))
+    assert sorted(part.name for part in own.boundary) == ["1_x", "2_x", "3_y", "4_y"]
+    solved = PlaneProblem(own)
+    for n, recording in enumerate(own.recordings):
+        found = solved.fields({}, n)
+        np.testing.assert_allclose(found["displacement"], recording.displacement, atol=1e-9)
+        np.testing.assert_allclose(found["force"], recording.force, atol=1e-6)

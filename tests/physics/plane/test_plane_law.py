@@ -104,6 +104,20 @@ def test_the_stiffness_of_another_law_serves():
         torch.testing.assert_close(near.displacement, exact.displacement[0].detach(), atol=1e-6, rtol=0)
 
 
+def test_small_strain_may_turn_a_triangle_inside_out():
+    """A declared linear elasticity has a prediction at any strain, however wrong; the others have none there."""
+    own = sheet(2)
+    fixed, motion = pulled(own, [-0.5])
+    small = PlaneLaw(LAW | {"law": "linear"})
+    found = own.equilibrium(small, fixed, motion)
+    assert bool((torch.linalg.det(own.gradient(found.displacement[0].detach()).reshape(-1, 2, 2)) < 0).all())
+    torch.testing.assert_close(
+        own.near(small, fixed, own.towards(small, fixed, 0 * own.nodes, motion[0], 0)).displacement, found.displacement[0].detach()
+    )
+    with pytest.raises(UserError, match="has no equilibrium"):
+        own.equilibrium(PlaneLaw(LAW), fixed, motion)
+
+
 @pytest.mark.parametrize(
     ("law", "effects", "message"),
     [

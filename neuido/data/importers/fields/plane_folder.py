@@ -71,7 +71,8 @@ def write_plane_folder(
             in a table of their own the places (x, y) and the parts of the boundary (boundary_x, boundary_y or bcx, bcy; empty or 0: free).
         out: The folder to create. None: check the content and write nothing.
         elements: Table of the nodes of the elements, three or four a row.
-        forces: Table of the forces on the parts of the boundary, a row a load step; or with `*` one file a load step, a row a part.
+        forces: Table of the forces on the parts of the boundary, a row a load step; or with `*` one file a load step, a row a part
+            in the order of their names.
         units: Unit of `displacement` (of places too) and of `force`, where the titles have none.
         thickness: Of the specimen, with its unit.
         condition: Plane `strain` or `stress`.
@@ -110,6 +111,7 @@ def write_plane_folder(
         for axis, a in enumerate(AXES)
         for name in dict.fromkeys(filter(None, marks[a]))
     ]
+    parts.sort(key=lambda part: natural_key(part.name))
     if not parts:
         raise UserError(f"{placed}: no node belongs to the boundary: name in columns boundary_x and boundary_y the part that moves it")
     force = None if forces is None else _forces(forces, len(steps), [part.name for part in parts], units)

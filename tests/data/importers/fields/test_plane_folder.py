@@ -6,7 +6,8 @@ import pytest
 import neuido
 from neuido.errors import UserError
 
-NODES = [(0, 0, 1, 3), (1, 0, 2, 3), (1, 1, 2, 0), (0, 1, 1, 0), (0.5, 0.4, 0, 0)]
+NODES = [(1, 0, 2, 3), (1, 1, 2, 0), (0, 1, 1, 0), (0, 0, 1, 3), (0.5, 0.4, 0, 0)]
+"""The second part of the boundary comes before the first."""
 OPTIONS = {"units": {"displacement": "mm", "force": "N"}, "condition": "stress"}
 
 
@@ -39,9 +40,9 @@ def test_steps_of_a_finite_element_program(tmp_path):
     assert lines[-1].startswith("next: neuido check")
     found = neuido.read_plane_experiment(tmp_path / "out")
     assert [(r.name, len(r.displacement)) for r in found.recordings] == [("fit", 2), ("held_out", 1)]
-    assert [part.name for part in found.boundary] == ["1_x", "2_x", "3_y"]
-    np.testing.assert_allclose(found.recordings[0].displacement[1, 2], [1e-4, -3e-5])
-    np.testing.assert_allclose(found.recordings[1].force, [[-220, 220, 0]])
+    assert [part.name for part in found.boundary] == ["2_x", "1_x", "3_y"]
+    np.testing.assert_allclose(found.recordings[0].displacement[1, 1], [1e-4, -3e-5])
+    np.testing.assert_allclose(found.recordings[1].force, [[220, -220, 0]])
     np.testing.assert_allclose(found.specimen.nodes[4].tolist(), [5e-4, 4e-4])
     assert found.specimen.triangles.tolist()[1] == [1, 2, 4]
     assert found.model["elasticity"]["young"] == pytest.approx(200 / (1e-3 * 2e-3) / 0.1, rel=0.3)
@@ -60,7 +61,7 @@ def test_places_and_forces_in_tables_of_their_own(tmp_path):
     files = [str(tmp_path / name) for name in ("nodes.csv", "displacement_1.csv", "displacement_2.csv")]
     read(tmp_path, files, forces=str(tmp_path / "forces.csv"), units={}, held_out=["displacement_1"])
     found = neuido.read_plane_experiment(tmp_path / "out")
-    assert {r.role: r.force[:, 1].tolist() for r in found.recordings} == {"fit": [400.0], "held_out": [200.0]}
+    assert {r.role: r.force[:, 0].tolist() for r in found.recordings} == {"fit": [400.0], "held_out": [200.0]}
 
 
 @pytest.mark.parametrize(
