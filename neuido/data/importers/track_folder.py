@@ -17,6 +17,9 @@ from neuido.errors import UserError
 
 LEAST_RUN = 5
 """Rows in order, on average, from which on a file is taken for several recordings one after the other, and not for rows in disorder."""
+SCALE_ERROR = 0.01
+"""Least relative standard deviation of a length scale. One read from an object in the picture, or of a sensor's calibration, is off by 1 to
+2 %, which would look like another gravity."""
 EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "µs"), (1e11, 1e3, "ms"))
 """Unix times since 1973 in smaller units than seconds: from which number on, units in a second, and name."""
 
@@ -121,7 +124,7 @@ def write_tracks(
     """
     from neuido.data.measured.track import read_tracks
 
-    summary, tables, recordings, scale_error = [], {}, [], 0.0
+    summary, tables, recordings, scale_error = [], {}, [], SCALE_ERROR
     model, said = declared_guide(guide, floor=floor, mass=mass)
     for name, (path, (t, points, notes, error, angle, _)) in takes.items():
         with naming(path):
@@ -154,8 +157,9 @@ def write_tracks(
         summary.append("mass or diameter of the body is unknown (--mass in kg, --diameter in m): forces are reported per unit mass")
     content = {"format": "neuido-track/1", "name": next(iter(takes)), "model": model, "bodies": {"body": figures},
                "recordings": recordings}  # fmt: skip
-    if scale_error:
+    if not any(take.angle for _, take in takes.values()):
         content["nuisances"] = {"length_scale": float(f"{scale_error:.2g}")}
+        summary.append(f"the length scale is taken to be known to {100 * scale_error:.2g} % (nuisances of track.yaml)")
     return summary + write_tables(out, "track.yaml", content, tables, read_tracks)
 
 

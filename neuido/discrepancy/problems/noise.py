@@ -59,6 +59,41 @@ def _window_squares(at: np.ndarray, values: np.ndarray, degree: int) -> np.ndarr
     return np.sum(left**2, axis=1)
 
 
+AROUND = 4
+"""Samples on either side of one that tell whether it is a stray."""
+STRAY = 8.0
+"""Distance of a stray from the cubic through its neighbours, in standard deviations of the noise or of what they leave of the cubic. The
+largest ratios found without strays are 5.3 at a bounce, 4.3 in 10,000 samples of noise, and 2.3 in a swing of four samples."""
+STRAY_SHARE = 0.05
+"""Largest share of the samples that may be strays: beyond it the course is not smooth."""
+
+
+def strays(at: np.ndarray, values: np.ndarray, noise: float) -> np.ndarray:
+    """Return which samples of smooth series lie far from their neighbours on both sides, as where a tracker lost its point, (n,).
+
+    Args:
+        at: Abscissae (n,), increasing.
+        values: Series (n, k).
+        noise: Standard deviation of their independent noise.
+    """
+    n, width = len(at), 2 * AROUND + 1
+    out = np.zeros(n, bool)
+    if n < width:
+        return out
+    x = np.lib.stride_tricks.sliding_window_view(at, width)
+    y = np.lib.stride_tricks.sliding_window_view(values, width, axis=0).swapaxes(1, 2)  # (windows, width, k)
+    every, ends = np.arange(len(x)), range(2, AROUND)
+    places = [(every, AROUND), *((every[:1], j) for j in ends), *((every[-1:], width - 1 - j) for j in ends)]
+    for windows, j in places:  # each sample is the middle of a window; those near an end are elsewhere in the first or last one
+        rows = np.delete(np.arange(width), j)
+        near, around = x[windows][:, rows] - x[windows, j, None], y[windows][:, rows] - y[windows, j, None]
+        basis = (near / np.ptp(x[windows], axis=1)[:, None])[..., None] ** np.arange(4)
+        found = np.linalg.pinv(basis) @ around
+        left = np.sqrt(np.sum((around - basis @ found) ** 2, axis=1) / (len(rows) - 4))
+        out[windows + j] |= (np.abs(found[:, 0]) > STRAY * np.maximum(left, noise)).any(axis=1)
+    return out if out.sum() <= STRAY_SHARE * n else np.zeros(n, bool)
+
+
 def surface(at: np.ndarray, values: np.ndarray) -> float | None:
     """Estimate the standard deviation of the independent noise of values at scattered places, by a smooth surface through them.
 

@@ -29,6 +29,7 @@ def test_angles_of_a_pendulum(tmp_path, head, factor, separator):
     neuido.import_file(path, tmp_path / "out", guide=Guide("pendulum", "80 cm"))
     read = neuido.read_tracks(tmp_path / "out")
     assert read.constraint.type == "pendulum" and read.constraint.figures["length"] == pytest.approx(0.8) and read.free == ("length",)
+    assert read.nuisances["length_scale"] == 0
     np.testing.assert_allclose(read.recordings[0].x[:, 0], SWING, atol=1e-7)
     np.testing.assert_allclose(read.recordings[0].t, T, atol=1e-6)
 
@@ -38,6 +39,7 @@ def test_coordinates_of_a_pendulum(tmp_path):
     path = table(tmp_path / "a.csv", "t (s),x (m),y (m),z (m)", T, 0.8 * np.sin(SWING), -0.8 * np.cos(SWING), jitter)
     said = neuido.import_file(path, tmp_path / "out", guide=Guide("pendulum", "0.8 m"))
     assert list(neuido.read_tracks(tmp_path / "out").recordings[0].axes) == [0, 1]
+    assert neuido.read_tracks(tmp_path / "out").nuisances["length_scale"] == 0.01 and any("known to 1 %" in line for line in said)
     assert any("z moves least and is left out for --guide pendulum" in line for line in said)
 
 

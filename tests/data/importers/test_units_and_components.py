@@ -43,6 +43,7 @@ UNITS = {
         [f"{s:.6f} N" if s > 1 else f"{1e3 * s:.6f} mN" for s in 20e-6 * STRESS],
         ";",
     ),
+    "a texture analyser": ("Distance (mm);Force (g)", cells(50 * STRAIN, "{:.6f}"), cells(20e-6 * STRESS / 9.80665e-3, "{:.7f}"), ","),
     "a number before the table": ("Max;40 %\nStrain;Stress", cells(100 * STRAIN, "{:.6f} %"), cells(STRESS, "{:.3f} Pa"), ";"),
 }
 
@@ -51,7 +52,7 @@ UNITS = {
 def test_units_in_cells(tmp_path, kind):
     head, strain, stress, separator = UNITS[kind]
     path = table(tmp_path / "a.csv", head, strain, stress, separator=separator)
-    neuido.import_file(path, tmp_path / "out", specimen=SPECIMEN if "Load" in head else None)
+    neuido.import_file(path, tmp_path / "out", specimen=SPECIMEN if "Load" in head or "Force" in head else None)
     same(tmp_path / "out")
 
 

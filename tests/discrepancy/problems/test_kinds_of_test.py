@@ -115,8 +115,42 @@ def test_repeats_give_the_scatter_of_specimens(tmp_path):
     problem = MaterialProblem(folder(tmp_path, SOLID, tests, L=l, **columns))
     spread = np.std(factors, ddof=1) * math.sqrt(np.mean(plain**2))
     assert all(r.noise == pytest.approx(spread, rel=0.1) for r in problem.recordings)
+    assert "unseen" not in problem.labels
     alone = MaterialProblem(folder(tmp_path, SOLID, tests[:1], L=l, **columns))
     assert 200 < alone.recordings[0].noise < 450
+    assert "No test was repeated" in alone.labels["unseen"]
+
+
+def test_a_test_without_a_repeat_has_the_scatter_of_those_that_have_one(tmp_path):
+    l = np.linspace(1.02, 2.0, 40)
+    plain = 1e5 * (l - l**-2)
+    rows = {"L": l, "S0": 0.97 * plain, "S1": 1.03 * plain, "S2": 3 * plain, "slow": 50 * l, "fast": l}
+    tests = [
+        {"name": f"a{i}", "mode": "uniaxial", "columns": {"stretch": "L", "nominal_stress": f"S{i}", "time": "fast" if i == 2 else "slow"}}
+        for i in range(3)
+    ]
+    noises = [r.noise for r in MaterialProblem(folder(tmp_path, SOLID, tests, **rows)).recordings]
+    assert noises[0] == noises[1] == pytest.approx(0.06 / math.sqrt(2) * math.sqrt(np.mean(plain**2)), rel=0.1)
+    assert noises[2] == pytest.approx(3 * noises[0], rel=0.1)
+
+
+def test_curves_and_creep_have_repeats_too(tmp_path):
+    rate = np.geomspace(1e-2, 1e2, 25)
+    columns = {f"S{i}": f * (5.0 + 2.0 * rate**0.5) for i, f in enumerate((0.95, 1.05))}
+    tests = [{"name": f"a{i}", "mode": "flow_curve", "columns": {"shear_rate": "rate", "shear_stress": f"S{i}"}} for i in range(2)]
+    (tmp_path / "flow").mkdir()
+    (tmp_path / "creep").mkdir()
+    problem = MaterialProblem(folder(tmp_path / "flow", FLUID, tests, rate=rate, **columns))
+    assert problem.recordings[0].noise == pytest.approx(math.log(1.05 / 0.95) / math.sqrt(2), rel=0.01)
+    t = np.geomspace(0.1, 100.0, 40)
+    strains = {f"g{i}": f * 1e-3 * (1 + np.log1p(t)) for i, f in enumerate((0.95, 1.05, 1.0))}
+    tests = [
+        {"name": f"a{i}", "mode": "simple_shear", "control": "stress", "columns": {"time": "t", "shear": f"g{i}", "shear_stress": "s"}}
+        for i in range(3)
+    ]
+    problem = MaterialProblem(folder(tmp_path / "creep", SOLID, tests, t=t, s=np.full(40, 200.0), **strains))
+    at = np.interp(np.linspace(0, t[-1] - t[0], 50), t - t[0], strains["g2"])
+    assert all(r.noise == pytest.approx(0.05 * math.sqrt(np.mean(at**2)), rel=0.05) for r in problem.recordings)
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,10 @@ CURVES = {
 ROWS = {
     "treloar-rubber": "strain_stiffening,second_invariant",
     "silicone-EF30_25T": "strain_stiffening,second_invariant",
+    "kawabata-rubber": "second_invariant,strain_stiffening",
+    "diani-rubber": "fibre,second_invariant",
+    "fish-relax": "relaxation_spectrum,creep",
+    "steel-s2": "nonlinear_backstress,kinematic_hardening",
     "oscillation": "fractional,hysteresis",
     "flow_curve": "herschel_bulkley,power_law",
 }
@@ -66,10 +70,12 @@ def written(data_root, target, row, *, origin=0.0, unit=1.0, axis=False, backwar
                 scale[key] *= unit
         if mixed:
             rows = np.random.default_rng(0).permutation(rows)
-        file = f"{test['file'].partition('.')[0]}.csv"
+        columns = "-".join(test["columns"].values()).replace(" ", "_")  # tests of one specimen share a file, others do not
+        file = f"{test['file'].partition('.')[0]}-{columns}.csv"
         np.savetxt(target / file, rows, delimiter=",", header=",".join(own.values()), comments="", fmt="%.12g")
         if axis:
-            test["direction"] = [0, 1, 0]
+            x, y, z = test.get("direction", [1, 0, 0])
+            test["direction"] = [y, x, z]
         if "rows" in test:
             test["rows"] = [math.ceil(n / every) for n in test["rows"]]
         test |= {"file": file, "columns": own, "scale": scale}

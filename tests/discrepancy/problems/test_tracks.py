@@ -6,7 +6,7 @@ import yaml
 
 from neuido.data.measured.track import read_tracks
 from neuido.discrepancy.inference.least_squares import levenberg_marquardt, run
-from neuido.discrepancy.problems.noise import correlation
+from neuido.discrepancy.problems.noise import correlation, strays
 from neuido.discrepancy.problems.tracks.track_problem import TrackProblem, flight_of, track_problems
 from neuido.physics.points.point_mass import Forces, fly
 
@@ -171,3 +171,27 @@ def test_bridge(data_root, body, most, least):
     before = problem.error(problem.predict([{}], 1)[0] - problem.recordings[1].y, 1)
     after = fitted(problem, "drag_quadratic")[2]
     assert least * before <= after <= most * before
+
+
+def test_a_frame_far_from_its_neighbours_is_left_out_and_told(tmp_path):
+    source = write(tmp_path, {"stone": Forces()})
+    rows = np.loadtxt(source / "stone-fit.csv", delimiter=",", skiprows=1)
+    rows[20, 1] += 3.0
+    np.savetxt(source / "stone-fit.csv", rows, delimiter=",", header="t,y", comments="")
+    (problem,) = track_problems(source)
+    assert [len(r.y) for r in problem.recordings] == [44, 27]
+    assert problem.labels["unseen"] == "Frames far from those before and after were left out: 1 of stone-fit."
+    left = [problem.error(problem.predict([{}], n)[0] - problem.recordings[n].y, n) for n in (0, 1)]
+    assert left[0] < 0.04 and left[1] < 3 * problem.recordings[1].noise
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_a_bounce_and_a_swing_of_few_frames_have_no_strays(noise):
+    t = np.arange(120) / 60
+    bounce = np.abs(np.sin(3.0 * t)) * 0.8 ** np.floor(3.0 * t / np.pi)
+    swing = np.sin(2 * np.pi * np.arange(120) / 4 + 0.3)
+    for x in (swing, bounce):
+        seen = np.column_stack([x, x]) + noise * np.random.default_rng(0).standard_normal((120, 2))
+        assert not strays(t, seen, max(noise, 1e-3)).any()
+    seen[[3, 60, 117], 1] += 0.3
+    assert np.flatnonzero(strays(t, seen, max(noise, 1e-3))).tolist() == [3, 60, 117]

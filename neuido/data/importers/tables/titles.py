@@ -49,7 +49,7 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
     "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
     "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|"
-    r"verl.ngerung|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
+    r"verl.ngerung|distance$|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
     r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub",
     "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
     "frame": r"frames?( ?#)?|frame[ _]?(idx|index|no\.?|nr\.?|number|id)|"
@@ -60,7 +60,7 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     r"punkt(nr|nummer)?|partikel|marke|marqueur|particule|marcador|part.cula",
     "angle": r"(.* )?angle|theta|θ|phi|φ|.*winkel|rotation|.*[ _]angle|.ngulo",
     "x": _place("x") + r"|abscisse|abscisa",
-    "y": _place("y") + r"|height\w*|h.he|hauteur|altura|ordonn.e|ordenada",
+    "y": _place("y") + r"|h|height\w*|h.he|hauteur|altura|ordonn.e|ordenada",
     "z": _place("z"),
 }
 _UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|ms|s|sec|min|pixels?|px|deg|rad|°"

@@ -13,6 +13,7 @@ _SPELLED = {
     "mpa": "MPa", "kpa": "kPa", "gpa": "GPa", "kn": "kN", "newton": "N", "px": "pixel",
     "meters": "m", "millimeters": "mm", "centimeters": "cm", "metres": "m", "millimetres": "mm", "centimetres": "cm", "inches": "inch",
     "lbs": "lbf", "lb": "lbf", "pounds": "lbf", "kp": "kgf", "kg": "kgf", "°": "deg", "grad": "deg", "µstrain": "microstrain",
+    "g": "gram_force",
     "m/m": "", "in/in": "", "cm/cm": "", "secs": "s", "sekunden": "s", "secondes": "s", "segundos": "s", "minuten": "min", "minutes": "min",
 }  # fmt: skip
 

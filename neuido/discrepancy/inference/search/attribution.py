@@ -206,7 +206,8 @@ def diagnose(
     tried, starts = fit_declared_model(problem, new_search, journal)
     course = first_effect(tried, starts)
     add_effects(course, most)
-    try_pairs(course, tried, starts)
+    if most > 1:
+        try_pairs(course, tried, starts)
     if len(course.found) == 1:
         widen(course.search, course.rounds[0], course.at, course.others.values())
     budget.conclude()

@@ -23,6 +23,8 @@ MOST_POINTS = 256
 """Largest number of parameter sets per batch."""
 FAINT = 1e-3
 """Least predicted storage or loss modulus, relative to the smallest measured one: an elastic law has no loss, which has no logarithm."""
+UNREPEATED = "No test was repeated on another specimen: how far specimens differ, often by 2 to 6 %, is not in the noise."
+"""What the answer says where `repeats.scatter` has nothing to go by."""
 UNLIKE = 1.25
 """Ratio of the stiffness of the model to that of the data where a loading begins, or the reverse, from which the answer says so."""
 
@@ -57,7 +59,7 @@ class MaterialProblem(Problem):
             nuisances=(),
             candidates=candidates,
             recordings=tuple(_recording(test, noise) for test, noise in zip(tests.tests, noises, strict=True)),
-            labels={"kind": "material test"} | ({"excluded": excluded} if excluded else {}),
+            labels={"kind": "material test"} | ({"excluded": excluded} if excluded else {}) | ({} if repeated else {"unseen": UNREPEATED}),
         )
         self.tests = tests
         self._chains = chains

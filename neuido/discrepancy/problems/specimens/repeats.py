@@ -17,6 +17,8 @@ COMMON = 0.5
 """Share of its range that two tests must have in common to count as repeats."""
 SAME_PACE = 1.5
 """Ratio of the mean rates of two tests up to which they are repeats, and from which they show the rate."""
+SAME_STRESS = 0.05
+"""Mean difference of two prescribed stresses, as a share of their size, up to which tests under them are repeats."""
 COMPARED = 50
 """Strains at which repeats are compared."""
 RESTS = 0.2
@@ -69,14 +71,18 @@ def noise_of(test: MaterialTest) -> float | None:
 
 
 def are_repeats(a: MaterialTest, b: MaterialTest) -> bool:
-    """Return whether two tests are of the same kind, over much the same range, and as fast."""
+    """Return whether two tests are of the same kind, over much the same range, and as fast, or under the same stress."""
     same = all(getattr(a, key) == getattr(b, key) for key in ("mode", "direction", "control", "true_stress", "periodic"))
-    if not same or a.control == "stress" or a.path.shape[1] > 1 or (a.time is None) != (b.time is None):
+    if not same or a.path.shape[1] > 1 or (a.time is None) != (b.time is None):
         return False
-    x, y = (strain_of(t)[: _first_loading(t), 0] for t in (a, b))
-    low, high = max(x.min(), y.min()), min(x.max(), y.max())
+    (x, _), (y, _) = _curve(a), _curve(b)
+    low, high = max(x[0], y[0]), min(x[-1], y[-1])
     if high - low < COMMON * max(np.ptp(x), np.ptp(y)) or min(len(x), len(y)) < LEAST_ROWS:
         return False
+    if a.control == "stress":
+        at = np.linspace(low, high, COMPARED)
+        one, other = (np.interp(at, _clock(t), t.stress[:, 0]) for t in (a, b))
+        return float(np.abs(one - other).mean()) < SAME_STRESS * float(np.abs(one).mean())
     if a.time is None or a.mode in CURVES:
         return True
     pace = math.log(mean_rate(a) / mean_rate(b))
@@ -97,33 +103,54 @@ def _first_loading(test: MaterialTest) -> int:
 
 
 def scatter(tests: MaterialTests) -> dict[int, float]:
-    """Estimate how much repeats differ: the standard deviation about their mean, in the unit of what was measured, of each of their tests.
+    """Estimate how much repeats differ: the standard deviation about their mean, in the unit of what was measured, by test.
 
     Specimens of one material differ by some percent, and so does a machine from day to day; no effect explains that, and no fit should.
+    A test that was not repeated counts with the share by which the others differ. Empty where no test was repeated.
     """
     chained = {i for chain in tests.histories() if len(chain) > 1 for i in chain}
     groups: list[list[int]] = []
     for i, test in enumerate(tests.tests):
-        if i in chained or test.mode in CURVES:
+        if i in chained or test.path.shape[1] > 1:
             continue
         own = next((g for g in groups if are_repeats(tests.tests[g[0]], test)), None)
         groups.append([i]) if own is None else own.append(i)
-    found = {}
+    found, shares = {}, []
     for group in (group for group in groups if len(group) > 1):
         curves = [_curve(tests.tests[i]) for i in group]
         low, high = max(c[0][0] for c in curves), min(c[0][-1] for c in curves)
         at = np.linspace(low, high, COMPARED)
-        values = np.stack([np.interp(at, *c) for c in curves])
-        found |= dict.fromkeys(group, float(np.sqrt(np.mean(values.var(axis=0, ddof=1)))))
+        values = np.stack([[np.interp(at, x, channel) for channel in y] for x, y in curves])
+        one = float(np.sqrt(np.mean(values.var(axis=0, ddof=1))))
+        found |= dict.fromkeys(group, one)
+        shares.append(one / _size(values, tests.tests[group[0]]))
+    for (i,) in (group for group in groups if len(group) == 1 and shares):
+        found[i] = float(np.sqrt(np.mean(np.square(shares)))) * _size(_curve(tests.tests[i])[1], tests.tests[i])
     return found
 
 
+def _size(values: np.ndarray, test: MaterialTest) -> float:
+    """Return the root mean square of what was measured; 1 of logarithms, whose scatter is a share already."""
+    return 1.0 if test.mode in CURVES else max(float(np.sqrt(np.mean(values**2))), 1e-300)
+
+
+def _clock(test: MaterialTest) -> np.ndarray:
+    """Return the times of a test from its first row [s], or the numbers of its rows."""
+    return np.arange(len(test.path), dtype=np.float64) if test.time is None else test.time - test.time[0]
+
+
 def _curve(test: MaterialTest) -> tuple[np.ndarray, np.ndarray]:
-    """Return strain and stress of the first loading, in the order of the strain."""
-    n = _first_loading(test)
-    e, s = strain_of(test)[:n, 0], test.stress[:n, 0]
+    """Return abscissae (n,), increasing, and what was measured at them, (w, n), over the first loading of a test.
+
+    The abscissa is a strain; of a test under a prescribed stress it is the time of the whole test, of a curve its frequency or rate.
+    """
+    values = test.measured.reshape(len(test.path), -1)
+    if test.control == "stress":
+        return _clock(test), values.T
+    n = len(values) if test.mode in CURVES else _first_loading(test)
+    e = strain_of(test)[:n, 0]
     order = np.argsort(e, kind="stable")
-    return e[order], s[order]
+    return e[order], values[:n][order].T
 
 
 def stiffness(tests: Sequence[MaterialTest], poisson: float) -> float | None:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from neuido.data.measured.track import AIR, AXES, Track, Tracks, read_tracks
-from neuido.discrepancy.problems.noise import SeriesError, correlation, high_pass
+from neuido.discrepancy.problems.noise import SeriesError, correlation, high_pass, strays
 from neuido.discrepancy.problems.problem import Point, Problem, Recording
 from neuido.discrepancy.problems.tracks.guides import guide_of, normal_of
 from neuido.discrepancy.problems.tracks.released import Released, scale_gradient, settle, settled_error
@@ -24,6 +24,8 @@ MOST_FRAMES = 3000
 """Frames of a recording that are fitted at the most, evenly spread: more add time and hardly any information."""
 EARLY = 0.4
 """Share of the frames of a held-out recording that determine its start and are not scored."""
+LEAST_STRAY = 1e-3
+"""Noise below which no frame is taken for a stray, as a share of the path: without noise every corner of a motion would be one."""
 IMPACT = 4.0
 """Loss of speed between two frames that counts as an impact, in standard deviations of the noise."""
 DISAGREE = 1e-3
@@ -40,7 +42,8 @@ class TrackProblem(Problem):
     The body is held until its release and then flies. Position, velocity, release time, length scale and time base of each recording are
     nuisances. `predict` fits them anew for every parameter set (`released.settle`), with the priors of the folder: to all frames of a
     `fit` recording, and to the first 40 % of a held-out one, of which only the later frames are scored. The inference has no nuisances.
-    Frames after an impact at the end of a flight are left out (`flight_of`). Times count from the first sample of each recording.
+    Frames after an impact at the end of a flight, and single frames far from their neighbours, are left out (`flight_of`). Times count
+    from the first sample of each recording.
 
     Args:
         tracks: The folder's content.
@@ -48,7 +51,7 @@ class TrackProblem(Problem):
     """
 
     def __init__(self, tracks: Tracks, body: str) -> None:
-        tracks = from_first_samples(tracks)
+        tracks, lost = without_strays(from_first_samples(tracks))
         self.tracks, self.body = tracks, body
         self._flights = [flight_of(track, tracks) for track in tracks.recordings if track.body == body]
         self.error_model = tracking_error(tracks)
@@ -65,7 +68,7 @@ class TrackProblem(Problem):
             nuisances=(),
             candidates=candidates,
             recordings=tuple(map(self._recording, self._flights, self._starts)),
-            labels={"kind": "track", "body": body, "ordinary": ordinary_sizes(tracks, body)},
+            labels={"kind": "track", "body": body, "ordinary": ordinary_sizes(tracks, body)} | _said(lost, self._flights),
         )
 
     def _released(self, track: Track, effects: set[str]) -> Released:
@@ -349,6 +352,26 @@ def _inside(value: float, lower: float, upper: float, *, nonzero: bool) -> float
 def from_first_samples(tracks: Tracks) -> Tracks:
     """Shift the clocks of tracks to zero at the first sample of each recording."""
     return replace(tracks, recordings=tuple(replace(track, t=track.t - track.t[0]) for track in tracks.recordings))
+
+
+def without_strays(tracks: Tracks) -> tuple[Tracks, dict[str, int]]:
+    """Return tracks without the frames where a tracker lost the point (`noise.strays`), and their number in each recording.
+
+    One frame that is off by a twentieth of the path would be more than all that a drag does.
+    """
+    kept, lost = [], {}
+    for track in tracks.recordings:
+        sigma = track.noise or high_pass([(track.t, channel) for channel in track.x.T]) or 0.0
+        far = strays(track.t, track.x, max(sigma, LEAST_STRAY * float(np.ptp(track.x, axis=0).max())))
+        lost[track.name] = int(far.sum())
+        kept.append(replace(track, t=track.t[~far], x=track.x[~far]) if far.any() else track)
+    return replace(tracks, recordings=tuple(kept)), lost
+
+
+def _said(lost: dict[str, int], flights: Sequence[Track]) -> dict[str, str]:
+    """Return the label that tells how many frames of a body's recordings were left out; none where none was."""
+    own = [f"{lost[track.name]} of {track.name}" for track in flights if lost[track.name]]
+    return {"unseen": f"Frames far from those before and after were left out: {', '.join(own)}."} if own else {}
 
 
 def flight_of(track: Track, tracks: Tracks) -> Track:
