@@ -100,7 +100,7 @@ def spoiled(row: int, column: int, value: float):
 
 E, T, M = "experiment.yaml", "track.yaml", "test.yaml"
 WRONG = {  # kind, what is done to it, words of the line
-    "no-file": ("experiment", remove(E), "neither"),
+    "no-file": ("experiment", remove(E), "none of experiment.yaml"),
     "two-kinds": ("experiment", text(T, "format: neuido-track/1\n"), "both"),
     "not-yaml": ("experiment", text(E, "a: [1, 2"), "YAML"),
     "list": ("experiment", text(E, "- 1\n"), "mapping"),
