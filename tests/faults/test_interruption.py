@@ -150,7 +150,7 @@ class Terminates(Callback):
 
     def send(self, trainer: Trainer, *_) -> None:
         if trainer.current_epoch == 1 and not received():
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)
 
 
 def fitted(state: Path, *callbacks: Callback, ckpt_path: Path | None = None) -> list[float]:
@@ -264,7 +264,7 @@ def test_a_signal_while_handlers_are_set_or_restored_ends_in_one_line(monkeypatc
         before = real(number, handler)
         calls.append(number)
         if len(calls) == call:
-            os.kill(os.getpid(), signal.SIGTERM)
+            signal.raise_signal(signal.SIGTERM)  # in this thread: a signal to the process may reach another one, and that later
         return before
 
     monkeypatch.setattr("neuido.commands.main._dispatch", lambda args: 0)
