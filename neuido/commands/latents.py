@@ -1,6 +1,7 @@
 """The `latents` command: signature and help alone, so that `--help` loads no torch."""
 
 import hashlib
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from neuido.models.operator.interpolation import Interpolation
 
 PARTS = ("space", "interpolation")
-COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5")
+COLOURS = tuple(f"C{k}" for k in range(10))
 
 
 def latents(
@@ -37,7 +38,7 @@ def latents(
     (monotonicity.csv), for these two and for all pairs of each family (pairs.csv). Needs scikit-learn for `space`.
 
     Args:
-        operator: File of the operator (`save_to` of Stage I), `pretrained`, `pretrained-family` or `pretrained-bounded`.
+        operator: File of the operator (`save_to` of Stage I), `pretrained`, `pretrained-materials` or `pretrained-family`.
         out: Folder to write.
         parts: Which of the two.
         ends: Names of the two latents; the softest and the stiffest of `family` where absent.
@@ -126,7 +127,7 @@ def draw_embedding(points: list[dict[str, Any]], path: Path) -> None:
 
     figure = Figure(figsize=(5.2, 4.2), layout="constrained")
     axes = figure.subplots()
-    for colour, family in zip(COLOURS, dict.fromkeys(p["family"] for p in points), strict=False):
+    for colour, family in zip(cycle(COLOURS), dict.fromkeys(p["family"] for p in points)):
         own = [p for p in points if p["family"] == family]
         logs = [math.log(max(p["modulus"], 1.0)) for p in own]
         shades = [to_rgba(colour, 0.3 + 0.7 * (v - min(logs)) / (max(logs) - min(logs) or 1.0)) for v in logs]

@@ -1,4 +1,4 @@
-"""Safetensors files that are not trusted: their tensors, their metadata, and whether they fit a module before memory is taken for it."""
+"""Safetensors files: written where all numbers are finite; read as not trusted, and compared with a module before memory is taken."""
 
 import json
 import os
@@ -8,10 +8,25 @@ from typing import Any, TypeVar
 
 import torch
 from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from neuido.data.files.parsing import naming, one_line, parser_errors
+from neuido.data.files.writing import atomic_write
 from neuido.errors import UserError
+
+
+def write_safetensors(path: str | os.PathLike, tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> None:
+    """Write tensors to a safetensors file atomically; an earlier file stays where they are refused.
+
+    Raises:
+        UserError: A tensor holds a NaN or an infinity.
+    """
+    for name, tensor in tensors.items():
+        if not _is_finite(tensor):
+            raise UserError(f"{path} is not written: {name} holds a NaN or an infinity")
+    with atomic_write(path) as hidden:
+        save_file(dict(tensors), hidden, metadata=None if metadata is None else dict(metadata))
 
 
 def read_safetensors(path: str | os.PathLike) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -81,5 +96,9 @@ def check_shapes(shapes: Mapping[str, torch.Size], tensors: Mapping[str, Tensor]
     for name, shape in shapes.items():
         if tensors[name].shape != shape:
             raise UserError(f"{words}: {name} is {tuple(tensors[name].shape)}, not {tuple(shape)}")
-        if tensors[name].is_floating_point() and not bool(torch.isfinite(tensors[name]).all()):
+        if not _is_finite(tensors[name]):
             raise UserError(f"{path}: {name} holds a NaN or an infinity")
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    return not tensor.is_floating_point() or bool(torch.isfinite(tensor).all())

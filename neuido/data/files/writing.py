@@ -39,7 +39,7 @@ def atomic_write(path: str | os.PathLike, *, keep_suffix: bool = False, digest: 
             if durable:
                 _sync(hidden)
             if digest:
-                write_text(_noted_digest(path), f"{sha256_of(hidden)}\n")
+                write_text(_note_of(path), f"{sha256_of(hidden)}\n")
             os.replace(hidden, path)
         except BaseException:
             remove(hidden)
@@ -61,13 +61,19 @@ def is_as_written(path: Path, *, unnoted: bool = False) -> bool:
         path: The file.
         unnoted: What is returned where nothing is noted, as of files of earlier versions.
     """
-    noted = _noted_digest(path)
-    if not noted.is_file():
+    noted = noted_digest(path)
+    if noted is None:
         return unnoted
-    return path.is_file() and noted.read_text().strip() == sha256_of(path)
+    return path.is_file() and noted == sha256_of(path)
 
 
-def _noted_digest(path: Path) -> Path:
+def noted_digest(path: Path) -> str | None:
+    """Return the SHA-256 that `atomic_write(..., digest=True)` noted of a file; none where nothing is noted."""
+    note = _note_of(path)
+    return note.read_text().strip() if note.is_file() else None
+
+
+def _note_of(path: Path) -> Path:
     return path.with_name(f".{path.name}.sha256")
 
 

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from neuido.data.files.parsing import read_json
 from neuido.data.files.values import with_prefix
-from neuido.data.files.writing import atomic_write, write_json
-from neuido.data.weight_files import read_safetensors
+from neuido.data.files.writing import write_json
+from neuido.data.weight_files import read_safetensors, write_safetensors
 from neuido.errors import UserError
 from neuido.models.inference.pipeline import rollout_laws
 from neuido.models.inference.prepared_scene import Laws, PreparedScene
@@ -177,8 +176,7 @@ class Method(nn.Module):
 
 def write_tensors(path: Path, tensors: dict[str, Tensor]) -> None:
     """Write a safetensors file atomically."""
-    with atomic_write(path) as hidden:
-        save_file(tensors, hidden)
+    write_safetensors(path, tensors)
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

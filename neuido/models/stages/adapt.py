@@ -32,6 +32,7 @@ from neuido.models.stages.image_module import (
     write_frame_scores,
     write_prediction,
 )
+from neuido.models.stages.training import gradients_of, is_finite
 from neuido.types import ParticleState
 
 GIGABYTE = 1e9
@@ -270,8 +271,7 @@ class AdaptModule(ImageModule):
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Skip a step whose gradient is not finite; restore the last working parameters if that happens repeatedly."""
-        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
-        if gradients and not bool(torch.stack([g.isfinite().all() for g in gradients]).all()):
+        if not is_finite(gradients := gradients_of(optimizer)):
             self._log({"train/not_finite": 1.0})
             for g in gradients:
                 g.zero_()

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from lightning.pytorch import LightningModule
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,6 +17,7 @@ from neuido.models.inference.pipeline import render_motion
 from neuido.models.inference.prepared_scene import PreparedScene
 from neuido.models.scoring import motion_scores as scores
 from neuido.models.scoring.lpips import LPIPS, Absent, open_lpips
+from neuido.models.stages.training import SteadyModule
 from neuido.types import ParticleState
 
 SCORES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
@@ -82,7 +82,7 @@ def image_losses(prepared: PreparedScene, motion: ParticleState, views: list[int
     )
 
 
-class ImageModule(LightningModule):
+class ImageModule(SteadyModule):
     """Base class that scores filmed scenes; subclasses have the options `out`, `lpips_backbone` and `lpips_net`."""
 
     def __init__(self) -> None:

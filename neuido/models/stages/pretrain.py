@@ -3,7 +3,6 @@
 from typing import Any, Literal
 
 import torch
-from lightning.pytorch import LightningModule
 from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 
@@ -19,11 +18,11 @@ from neuido.models.stages.operator_scores import (
     viscosity_errors,
     viscosity_scores,
 )
-from neuido.models.stages.training import optimiser_steps, validation_scores
+from neuido.models.stages.training import SteadyModule, optimiser_steps, validation_scores
 from neuido.types import TrajectoryBatch
 
 
-class PretrainModule(LightningModule):
+class PretrainModule(SteadyModule):
     """Train the operator on constitutive data (Stage I).
 
     The data module yields balanced batches. It provides `names`, `families`, `stress_rms`, `residual_rms` and `viscosity` of the

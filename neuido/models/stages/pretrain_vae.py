@@ -4,17 +4,16 @@ import math
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule
 from torch import Tensor
 
 from neuido.data.clips import FlowBatch
 from neuido.errors import UserError
-from neuido.models.stages.training import optimiser_steps, report_and_save, validation_scores
+from neuido.models.stages.training import SteadyModule, optimiser_steps, report_and_save, validation_scores
 from neuido.models.video.flow import encode_flow
 from neuido.models.video.flow_vae import FlowVAE
 
 
-class FlowVAEModule(LightningModule):
+class FlowVAEModule(SteadyModule):
     """Train the VAE to reconstruct flow videos, with a weak KL prior; the weights of the best validation are kept.
 
     Args:

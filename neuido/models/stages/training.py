@@ -1,15 +1,70 @@
-"""Shared parts of the training modules: the number of steps, final reports, and opening of operator and encoder."""
+"""Shared parts of the training modules: steps that are skipped, the number of steps, final reports, and opening of operator and encoder."""
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_only
+from torch import Tensor
 
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.video.encoder import DynamicsEncoder
+
+SKIPPED_IN_A_ROW = 50
+"""Steps with a gradient that is not finite after which a training ends: single bad scenes are passed over, bad weights are not."""
+
+
+class SteadyModule(LightningModule):
+    """Base class of trainings that never step on a loss or a gradient that is not finite.
+
+    Such a step is skipped, said on standard error and logged as `train/failed`. One infinite component is enough to make all weights NaN:
+    clipping multiplies it by zero. The backward pass of a rollout may overflow where the rollout itself does not.
+    """
+
+    skipped = 0
+    """Number of steps that were skipped."""
+    _skipped_in_a_row = 0
+
+    def on_before_backward(self, loss: Tensor) -> None:
+        """Make the gradient of a loss that is not finite NaN, which all processes of a training see."""
+        if loss.requires_grad:
+            loss.register_hook(lambda gradient: torch.where(loss.detach().isfinite(), gradient, torch.nan))
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Skip a step whose gradient is not finite.
+
+        Raises:
+            UserError: That happened `SKIPPED_IN_A_ROW` times in a row.
+        """
+        if is_finite(gradients := gradients_of(optimizer)):
+            self._skipped_in_a_row = 0
+            return
+        optimizer.zero_grad(set_to_none=True)  # zeros would still move the weights, by the momentum
+        self.skipped += 1
+        self._skipped_in_a_row += 1
+        self.log("train/failed", 1.0, batch_size=1)
+        if self._skipped_in_a_row >= SKIPPED_IN_A_ROW:
+            raise UserError(
+                f"the training ends: at step {self.global_step} the gradient was not finite, as in the {SKIPPED_IN_A_ROW - 1} before; "
+                f"lower model.lr = {self.hparams.get('lr')}, or start from other weights"
+            )
+        if self.trainer.is_global_zero:
+            bad = sum(not is_finite([gradient]) for gradient in gradients)
+            print(f"step {self.global_step} is skipped: {bad} of {len(gradients)} gradients are not finite", file=sys.stderr)
+
+
+def gradients_of(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    """Return the gradients of all parameters that have one."""
+    return [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+
+
+def is_finite(gradients: list[Tensor]) -> bool:
+    """Return whether no gradient holds a NaN or an infinity."""
+    return not gradients or bool(torch.stack([g.isfinite().all() for g in gradients]).all())
 
 
 def optimiser_steps(trainer: Trainer) -> int:

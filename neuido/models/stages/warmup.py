@@ -15,19 +15,16 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import torch
-from lightning.pytorch import LightningModule
-from safetensors.torch import save_file
 from torch import Tensor
 
 from neuido.data.bodies.families import laws
 from neuido.data.clips import Clip, FilmDataModule
-from neuido.data.files.writing import atomic_write
 from neuido.data.progress import Progress
-from neuido.data.weight_files import read_safetensors
+from neuido.data.weight_files import read_safetensors, write_safetensors
 from neuido.errors import UserError
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
-from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
+from neuido.models.stages.training import SteadyModule, open_operator_and_encoder, optimiser_steps, report_and_save
 from neuido.models.stages.true_properties import effective_viscosity, properties_of
 from neuido.models.video.material_properties import LENGTH_POWERS, LOGARITHMIC, UNITS, to_scale
 from neuido.models.video.reader import NORMAL, Distribution, Reader
@@ -69,7 +66,7 @@ def compare_laws(operator: IntrinsicDynamicsOperator, z: Tensor, trial: Tensor, 
     return LawErrors(stress_error.mean(1), plastic_error.mean(1), size)
 
 
-class WarmupModule(LightningModule):
+class WarmupModule(SteadyModule):
     """Train the projector so that the law inferred from a clip matches the law that made it; operator and VAE are frozen.
 
     The data module is a `FilmDataModule` with `frames: 0`.
@@ -241,9 +238,8 @@ class WarmupModule(LightningModule):
             for k, v, c in zip(missing, volume.cpu().split(sides * views), conditions.cpu().split(sides * views)):
                 found[k] = v.unflatten(0, (sides, views)), c.unflatten(0, (sides, views))
                 if (path := kept[k]) is not None:
-                    with atomic_write(path) as hidden:
-                        tensors = {"volume": found[k][0].contiguous(), "conditions": found[k][1].contiguous()}
-                        save_file(tensors, hidden, metadata={"digest": _digest(*tensors.values())})
+                    tensors = {"volume": found[k][0].contiguous(), "conditions": found[k][1].contiguous()}
+                    write_safetensors(path, tensors, {"digest": _digest(*tensors.values())})
         return found  # type: ignore[return-value]
 
     def training_step(self, numbers: Tensor, batch_idx: int) -> Tensor:

@@ -21,12 +21,12 @@ from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
 from neuido.data.files.output_folder import claimed_folder
-from neuido.data.files.writing import is_as_written, sha256_of, write_arrays, write_json
+from neuido.data.files.writing import is_as_written, noted_digest, sha256_of, write_arrays, write_json
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
-from neuido.models.video.clip_bodies import GROUPS, frame_steps, launch, random_body
+from neuido.models.video.clip_bodies import GROUPS, frame_steps, launch, random_body, random_shape
 from neuido.models.video.flow import PRESETS, measure_velocities
 from neuido.physics.laws.resets import VolumetricReset
 from neuido.physics.linalg.decompositions import polar
@@ -148,8 +148,27 @@ def _generate_shard(plan: ClipPlan, folder: Path, chosen: torch.device, batch: i
                 for written in [pool.submit(_write_clip, plan, folder, clip, seen) for clip, seen in zip(group, filmed)]:
                     written.result()
             work.update(len(group))
-    if (missing or not (folder / "index.json").exists()) and all(left_out(name) or whole(name) for name in names):
-        entries = [_entry(plan, folder, i) for i, name in enumerate(names) if not left_out(name)]
+    kept = [i for i, name in enumerate(names) if not left_out(name)]
+    if (missing or not published) and all((folder / f"{names[i]}.npz").is_file() for i in kept):  # else a shard that ends later does it
+        _write_index(plan, folder, kept, own, whole, progress)
+
+
+def _write_index(plan: ClipPlan, folder: Path, kept: list[int], own: range, whole: Callable[[str], bool], progress: bool) -> None:
+    """Write index.json if the clips of other shards are whole; the own ones were checked before, or just written."""
+
+    def digest(number: int) -> str | None:
+        name = f"clip-{number:05d}"
+        if number in own or whole(name):
+            return noted_digest(folder / f"{name}.npz") or sha256_of(folder / f"{name}.npz")
+        return None
+
+    entries = []
+    with Progress("check of all clips", len(kept), unit="clips", shown=progress) as work, ThreadPoolExecutor(os.cpu_count()) as pool:
+        for number, found in zip(kept, pool.map(digest, kept)):
+            if found is not None:
+                entries.append(_entry(plan, number, found))
+            work.update()
+    if len(entries) == len(kept):
         write_json(folder / "index.json", {"format": FORMAT, "plan": asdict(plan), "clips": entries})
 
 
@@ -172,13 +191,11 @@ def steps_of(plan: ClipPlan, number: int) -> int:
     return _timing(plan, number, *_material(plan, number))[1]
 
 
-def _entry(plan: ClipPlan, folder: Path, number: int) -> dict[str, Any]:
-    """Return what index.json says of a clip."""
-    name = f"clip-{number:05d}"
+def _entry(plan: ClipPlan, number: int, digest: str) -> dict[str, Any]:
+    """Return what index.json says of a clip whose file has a SHA-256."""
     family, parameters = _material(plan, number)
-    shape = random_body(_source(plan, number, "body"), *plan.body_options(number))[0]
-    digest = sha256_of(folder / f"{name}.npz")
-    return {"name": name, "family": family, "parameters": parameters, "shape": shape, "sha256": digest}
+    shape = random_shape(_source(plan, number, "body"), plan.shapes_of(number), plan.published)
+    return {"name": f"clip-{number:05d}", "family": family, "parameters": parameters, "shape": shape, "sha256": digest}
 
 
 def _source(plan: ClipPlan, number: int, what: str) -> np.random.Generator:

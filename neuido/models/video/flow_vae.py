@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
 from neuido.data.files.missing_weights import weights_hint
 from neuido.data.files.values import mapping
-from neuido.data.files.writing import atomic_write
-from neuido.data.weight_files import build, parse_metadata, read_safetensors
+from neuido.data.weight_files import build, parse_metadata, read_safetensors, write_safetensors
 from neuido.errors import UserError
 
 FORMAT = "neuido-flow-vae/1"
@@ -190,8 +188,7 @@ def write_weights(
     path: str | os.PathLike, kind: str, config: Mapping[str, Any], tensors: dict[str, Tensor], card: Mapping[str, Any]
 ) -> None:
     """Write a safetensors file with its format, configuration and card atomically."""
-    with atomic_write(path) as hidden:
-        save_file(tensors, hidden, metadata={"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
+    write_safetensors(path, tensors, {"format": kind, "config": json.dumps(dict(config)), "card": json.dumps(dict(card))})
 
 
 def read_weights(path: str | os.PathLike, kinds: tuple[str, ...], option: str) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Any]]:

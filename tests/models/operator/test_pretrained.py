@@ -2,13 +2,17 @@
 
 import re
 
+import numpy as np
 import pytest
 import torch
 
-from neuido.data.bodies.families import PUBLISHED, laws
+from neuido.data.bodies.families import PARAMETERS, PUBLISHED, laws
 from neuido.models.operator.dynamics_operator import PRETRAINED, IntrinsicDynamicsOperator
+from neuido.models.stages.operator_scores import silhouette
 from neuido.models.stages.pretrain import PretrainModule
 
+FAMILIES_OF_CARD = {"pretrained-materials": tuple(PARAMETERS)}
+"""Families that the card of an operator lists, where they are not the first three."""
 FAMILY_OF = {name: family for family, (name, _) in PUBLISHED.items()}
 
 
@@ -29,8 +33,10 @@ def deformations(strain: float, count: int = 2000) -> torch.Tensor:
 def test_file(operator, name_of_file):
     assert PRETRAINED[name_of_file].stat().st_size < 4e6
     assert set(FAMILY_OF) <= set(operator.latent_names)
-    assert len(operator.latents) == 90
-    assert operator.config["trunk"] == ("bounded" if name_of_file == "pretrained" else "objective")
+    assert len(operator.latents) == (480 if name_of_file == "pretrained-materials" else 90)
+    trunk = {"pretrained": "bounded", "pretrained-materials": "general"}.get(name_of_file, "objective")
+    assert operator.config["trunk"] == trunk
+    assert operator.config.get("viscous", False) == (trunk == "general")
     assert operator.config["latent_dim"] == 128
 
 
@@ -57,6 +63,28 @@ def test_laws_are_near_the_classical_ones(operator, name):
 
 
 @torch.no_grad()
+def test_eight_families_and_their_viscosities():
+    """Only fluids have a viscosity, and what they are sheared by is forgotten."""
+    operator = IntrinsicDynamicsOperator.load("pretrained-materials")
+    families = np.array(operator.latent_families)
+    assert {family: int((families == family).sum()) for family in PARAMETERS} == dict.fromkeys(PARAMETERS, 60)
+    assert float(silhouette(operator.latents, operator.latent_families)) == pytest.approx(0.616, abs=0.005)
+    viscosity = operator.viscosity(operator.latents)
+    assert viscosity[~np.isin(families, ("fluid", "viscoplastic"))].max() < 1e-3  # Pa s
+    assert 0.09 < viscosity[families == "fluid"].min() < 0.2 < 50 < viscosity[families == "fluid"].max() < 101
+    F = deformations(1e-2, 300)
+    fluids = operator.latents[torch.from_numpy(families == "fluid")]
+    kept = deviator(operator.plastic(fluids, F.expand(60, *F.shape))) / deviator(F)
+    assert kept.median() < 2e-3 and kept.max() < 0.02
+
+
+def deviator(F: torch.Tensor) -> torch.Tensor:
+    """The norm of the deviator of the Hencky strain."""
+    strain = torch.linalg.svdvals(F).log()
+    return (strain - strain.mean(-1, keepdim=True)).norm(dim=-1)
+
+
+@torch.no_grad()
 def test_materials_differ(operator):
     """The check above would pass for one law under three names if the names were mixed up; they are not."""
     F = deformations(1e-2)
@@ -65,11 +93,14 @@ def test_materials_differ(operator):
 
 
 def test_a_fit_starts_from_them(operator, name_of_file):
-    module = PretrainModule(90, operator.trunk, init_from=name_of_file)
+    viscous = operator.config.get("viscous", False)
+    module = PretrainModule(len(operator.latents), operator.trunk, viscous=viscous, init_from=name_of_file)
     for (name, mine), theirs in zip(module.operator.state_dict().items(), operator.state_dict().values(), strict=True):
         assert torch.equal(mine, theirs), name
     assert torch.equal(module.latents, operator.latents)
-    other = PretrainModule(6, operator.trunk, init_from=name_of_file)  # other trajectories: the weights without their latents
+    other = PretrainModule(
+        6, operator.trunk, viscous=viscous, init_from=name_of_file
+    )  # other trajectories: the weights without their latents
     assert torch.equal(other.operator.elastic_trunk.out.weight, operator.elastic_trunk.out.weight)
     assert other.latents.shape == (6, 128)
 
@@ -77,13 +108,14 @@ def test_a_fit_starts_from_them(operator, name_of_file):
 def test_the_card_quotes_the_file(operator, name_of_file):
     """Every figure of the card's first table is that of the file, and so are date and number of steps."""
     file = PRETRAINED[name_of_file]
+    named = FAMILIES_OF_CARD.get(name_of_file, ("elastic", "plasticine", "sand"))
     card = (file.parent / "README.md").read_text().split(f"# Model card: `{file.name}`")[1].split("# Model card: ")[0]
     section = card.split("## Figures")[1].split("Median relative error of the stress, over")[0]
     rows = dict(re.findall(r"^\| ([^|]+?) \| (.+) \|$", section, flags=re.MULTILINE))
     figures = operator.card["figures"]
     keys = {
         "stress error": ["stress_error"],
-        "stress error, elastic / plasticine / sand": [f"stress_error/{family}" for family in ("elastic", "plasticine", "sand")],
+        "stress error, " + " / ".join(named): [f"stress_error/{family}" for family in named],
         "stress MSE [Pa²]": ["stress_mse"],
         "plastic error where it flows": ["plastic_error_yielding"],
         "plastic error, elastic / plasticine / sand": [f"plastic_error/{family}" for family in ("elastic", "plasticine", "sand")],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neuido.errors import UserError
-from neuido.models.video.clip_bodies import GROUPS, PUBLISHED, SOLIDS, frame_steps, launch, random_body
+from neuido.models.video.clip_bodies import GROUPS, PUBLISHED, SOLIDS, frame_steps, launch, random_body, random_shape
 
 
 def test_no_shape_is_in_two_groups():
@@ -17,6 +17,7 @@ def test_bodies_fit_between_the_walls_and_can_be_filled_again(group):
     seen = set()
     for number in range(12):
         name, x, volume = random_body(np.random.default_rng(number), 300, group, False)
+        assert name == random_shape(np.random.default_rng(number), group, False)
         again, other, same = random_body(np.random.default_rng(number), 300, group, False, fill=1)
         seen.add(name)
         assert again == name and volume == pytest.approx(same, rel=0.12) and not np.array_equal(x, other)
