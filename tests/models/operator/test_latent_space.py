@@ -126,6 +126,9 @@ def test_interpolation_is_softer_to_stiffer(operator):
     assert found.rows[-1]["modulus"] == pytest.approx(float(end.detach()), rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    "operator", [pytest.param(n, marks=[pytest.mark.slow] * (n == "pretrained-materials")) for n in PRETRAINED], indirect=True
+)
 def test_all_pairs(operator):
     found = interpolation.pairwise_monotonicity(operator, "sand", count=5)
     assert found["pairs"] > 300
