@@ -23,6 +23,9 @@ FASTEST, SLOWEST = 30.0, 3e-3
 """Acceleration, relative to gravity, above which lengths are in another unit, and below which times are: (1/30)^2 is that of frames."""
 UPRIGHT, BENT = 0.8, 5.0
 """Share of gravity that a fall along an axis has at the least, and how many times the noise it is seen above."""
+CERTAIN, STEADY, ERRORS = 0.1, 0.2, 3.0
+"""What an acceleration may be off from gravity, and change by in a flight, as shares of gravity, for nothing else to be meant; and how many
+standard errors are added to both. Drag of 1/s, lift and circles change it by more."""
 FARTHEST = 1e3
 """Distance [m] above which positions are taken to be in another unit."""
 GAP = 10.0
@@ -50,8 +53,8 @@ def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where:
         where: Name of the recording in error messages.
 
     Raises:
-        UserError: The path is a parabola whose acceleration differs from gravity by a unit (pixels, millimetres, milliseconds, frames) or
-            by its sign.
+        UserError: The path is a parabola whose acceleration differs from gravity by a unit (pixels, millimetres, milliseconds, frames), or
+            within noise by its sign alone. Where drag or lift may turn the sign, it is a warning.
     """
     if len(t) < 6 or abs(gravity) < 1 or np.ptp(x) == 0:
         return
@@ -72,14 +75,18 @@ def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where:
         )
     sign = f"{axis} points down" if ratio < 0 else ""
     unit = "the unit is not metres" if abs(ratio) > FASTEST else ""
-    raise UserError(
-        f"{told}: {' and '.join(filter(None, (unit, sign)))}; give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import` with "
+    change = (
+        f"give about scale: {{{axis}: {1 / ratio:.3g}}}, or use `neuido import` with "
         f"{' and '.join(filter(None, ('--scale' if unit else '', '--y_down true' if sign else '')))}"
     )
+    if not unit and not _is_gravity(t, x[:, None], [-gravity], abs(gravity)):
+        _warn(f"{told}: {sign}, or drag or lift turns it? If it points down, {change}")
+        return
+    raise UserError(f"{told}: {' and '.join(filter(None, (unit, sign)))}; {change}")
 
 
 def check_upright(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], axes: Sequence[str], where: str) -> None:
-    """Check that a free flight falls along the declared gravity, and not along another axis.
+    """Check that a free flight falls along the declared gravity, and warn where it may fall along another axis.
 
     Args:
         t: Times [s], (n,).
@@ -89,7 +96,7 @@ def check_upright(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], axes: 
         where: Name of the recording in error messages.
 
     Raises:
-        UserError: The body falls by about this acceleration along another axis, and not along that of gravity.
+        UserError: The acceleration is within noise this gravity along another axis, and stays so.
     """
     size = float(np.linalg.norm(gravity))
     if len(t) < 6 or size < 1 or max(map(abs, gravity)) < UPRIGHT * size:
@@ -108,10 +115,31 @@ def check_upright(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], axes: 
     if other == down or not level or not bent[other] or not UPRIGHT < abs(found[other]) / size < 2 - UPRIGHT:
         return
     change = "--up z" if other == "z" and found[other] < 0 else "--columns.y for the height (and --y_down true where it points down)"
-    raise UserError(
-        f"{where}: the acceleration along {other} is {found[other]:.3g} m/s^2, as of gravity, and {found[down]:.2g} along {down}, where "
-        f"gravity is declared: is {other} the vertical? Give {change} to `neuido import`, or another model.gravity"
-    )
+    fitted = ", ".join(f"{value:.3g}" for value in found.values())
+    text = f"{where}: the acceleration ({', '.join(axes)}) is ({fitted}) m/s^2, and gravity is declared along {down}"
+    along = [math.copysign(size, found[axis]) if axis == other else 0.0 for axis in axes]
+    if _is_gravity(t, x, along, size):
+        raise UserError(
+            f"{text}: that along {other} is as of gravity, so {other} is the vertical. Give {change} to `neuido import`, or another "
+            "model.gravity"
+        )
+    _warn(f"{text}: if {other} is the vertical, give {change} to `neuido import`; drag, lift or a circle may look like this too")
+
+
+def _is_gravity(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], size: float) -> bool:
+    """Return whether the acceleration of a path x (n, A) [m] is within noise this gravity (A,), of `size` [m/s^2], and stays so."""
+    span = float(t[-1] - t[0])
+    time = 2 * (t - t[0]) / span - 1
+    parts = []  # acceleration of a parabola, and the change from start to end by a cubic, each with its standard error
+    for degree, factor in ((2, 8.0), (3, 96.0)):
+        basis = np.polynomial.polynomial.polyvander(time, degree)
+        curve, *_ = np.linalg.lstsq(basis, x, rcond=None)
+        left = np.sum((x - basis @ curve) ** 2, axis=0) / max(len(t) - degree - 1, 1)
+        error = np.sqrt(left * np.linalg.inv(basis.T @ basis)[degree, degree])
+        parts.append((factor / span**2 * curve[degree], factor / span**2 * float(np.linalg.norm(error))))
+    (found, error), (change, doubt) = parts
+    away = float(np.linalg.norm(found - np.asarray(gravity)))
+    return away + ERRORS * error < CERTAIN * size and float(np.linalg.norm(change)) + ERRORS * doubt < STEADY * size
 
 
 def lost_positions(x: np.ndarray) -> np.ndarray:

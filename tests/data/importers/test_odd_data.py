@@ -5,7 +5,15 @@ import warnings
 import numpy as np
 import pytest
 
-from neuido.data.measured.motion_plausibility import check_figures, check_flight, check_motion, check_positions, check_track, lost_positions
+from neuido.data.measured.motion_plausibility import (
+    check_figures,
+    check_flight,
+    check_motion,
+    check_positions,
+    check_track,
+    check_upright,
+    lost_positions,
+)
 from neuido.data.measured.plausibility import check_density, check_rows, check_stress
 from neuido.errors import PlausibilityWarning, UserError
 
@@ -123,3 +131,21 @@ def test_odd_bodies():
         check_motion(x * [1, -1, 1], t, x0, v0, volume, gravity, "a")
     with pytest.warns(PlausibilityWarning, match=r"positions lie outside scene\.domain, the first of point \d+ in frame \d at"):
         check_positions(x, x0, np.arange(40), np.zeros(3), np.array([0.61, 1.0, 1.0]), "a")
+
+
+def test_another_vertical_is_refused_only_where_nothing_else_can_be_meant():
+    """A level circle of 1 g, and a throw downwards that drag brakes, are warned of; a plain throw along another axis is refused."""
+    t = np.linspace(0, 0.8, 40)
+    angle = np.sqrt(9.81 / 4.0) * (t - 0.4)
+    circle = np.stack([4 * np.sin(angle), 0 * t, 4 * np.cos(angle)], 1)
+    gravity, noise = [0.0, -9.81, 0.0], 1e-3 * np.random.default_rng(0).standard_normal((40, 3))
+    plain = np.stack([t, 0.5 * t, 2 * t - 4.905 * t**2], 1)
+    with pytest.raises(UserError, match=r"z is as of gravity, so z is the vertical\. Give --up z"):
+        check_upright(t, plain + noise, gravity, "xyz", "a")
+    with pytest.warns(PlausibilityWarning, match=r"is \(.*, -9.* and gravity is declared along y: if z is the vertical, give --up z"):
+        check_upright(t, circle + noise, gravity, "xyz", "a")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_upright(t, plain[:, [0, 2, 1]] + noise, gravity, "xyz", "a")
+    with pytest.warns(PlausibilityWarning, match="y points down, or drag or lift turns it"):
+        check_flight(t, -15 * (1 - np.exp(-t)) + noise[:, 1], -9.81, "y", "a")  # thrown down, braked by twice its weight
