@@ -189,8 +189,8 @@ def _has_test(table: Table, columns: dict[str, str]) -> bool:
     """Whether a table of several has a strain and a stress; results and statistics of a machine's sheets have none."""
     given = {quantity: title for quantity, title in columns.items() if title in table.titles}
     found = set(find_columns(table.titles, given, table.units))
-    path = found & {"strain", "log_strain", "green_strain", "stretch", "stretch_1", "strain_1", "displacement", "displacement_1", "shear",
-                    "time"}  # fmt: skip
+    path = found & {"strain", "log_strain", "green_strain", "green_strain_1", "stretch", "stretch_1", "strain_1", "displacement",
+                    "displacement_1", "shear", "time"}  # fmt: skip
     load = found & {"force", "force_1", "nominal_stress", "nominal_stress_1", "true_stress", "second_piola_stress", "shear_stress",
                     "relaxation_modulus", "storage_modulus", "compliance", "viscosity"}  # fmt: skip
     return bool((path or found & {"rate", "frequency"}) and load)

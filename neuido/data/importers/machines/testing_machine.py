@@ -170,7 +170,9 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
     """Return stretch or logarithmic strain, and nominal or true stress."""
     found, out = given.found, {}
     found |= {
-        own: found[f"{own}_1"] for own in ("stretch", "strain", "nominal_stress", "force") if own not in found and f"{own}_1" in found
+        own: found[f"{own}_1"]
+        for own in ("stretch", "green_strain", "strain", "nominal_stress", "force")
+        if own not in found and f"{own}_1" in found
     }
     pairs = [("log_strain", "true_stress"), ("stretch", "nominal_stress"), ("strain", "nominal_stress")]
     path = next((p for p, s in pairs if p in found and s in found and p in ("stretch", "strain")), None)
@@ -181,7 +183,7 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
     if path == "stretch":
         out["stretch"] = given.column("stretch", "", required=False)
     elif path == "green_strain":
-        out["stretch"] = _stretch_of_green(given)
+        out["stretch"] = _stretch_of_green(given, "green_strain")
     elif path == "displacement":
         length = given.size("length", "has a displacement of a specimen")
         moved = given.column("displacement", "m")
@@ -220,15 +222,16 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
     return out
 
 
-def _stretch_of_green(given: MachineTable) -> np.ndarray:
+def _stretch_of_green(given: MachineTable, quantity: str) -> np.ndarray:
     """Return the stretch of a Green strain E, sqrt(1 + 2 E)."""
-    strain = given.strain("green_strain")
+    strain = given.strain(quantity)
     if (strain <= -0.5).any():
         raise UserError(
-            f"{given.name}: {given.title('green_strain')!r} reaches {np.nanmin(strain):.3g}, and a Green strain is above -0.5: is it an "
-            "engineering strain (--columns.strain), or is compression positive?"
+            f"{given.name}: {given.title(quantity)!r} reaches {np.nanmin(strain):.3g}, and a Green strain is above -0.5: is it an "
+            f"engineering strain (--columns.{quantity.removeprefix('green_')}), or is compression positive?"
         )
-    given.summary.append("stretch = sqrt(1 + 2 E) of the Green strain E")
+    if "stretch = sqrt(1 + 2 E) of the Green strain E" not in given.summary:
+        given.summary.append("stretch = sqrt(1 + 2 E) of the Green strain E")
     return np.sqrt(1 + 2 * strain)
 
 
@@ -253,12 +256,15 @@ def _biaxial(given: MachineTable) -> dict[str, np.ndarray]:
     for axis in "12":
         if f"stretch_{axis}" in given.found:
             out[f"stretch_{axis}"] = given.column(f"stretch_{axis}", "", required=False)
+        elif f"green_strain_{axis}" in given.found:
+            out[f"stretch_{axis}"] = _stretch_of_green(given, f"green_strain_{axis}")
         elif f"strain_{axis}" in given.found:
             out[f"stretch_{axis}"] = 1 + given.strain(f"strain_{axis}")
         elif f"displacement_{axis}" in given.found:
             length = given.size("length", "has displacements of a specimen")
             out[f"stretch_{axis}"] = 1 + given.column(f"displacement_{axis}", "m") / length
         else:
+            given.refuse_component(f"e{2 * axis}", "a Green or an engineering strain", (f"green_strain_{axis}", f"strain_{axis}"))
             raise given.missing(f"column for stretch_{axis}", f"stretch_{axis}")
     for axis in "12":
         if f"nominal_stress_{axis}" in given.found:

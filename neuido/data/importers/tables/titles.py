@@ -13,6 +13,11 @@ def _axis(words: str, letters: str, number: str, axis: str) -> str:
     return rf"({words})[ _.#]*({number}{{1,2}}|{axis}{{1,2}})|({letters})[ _]?{number}"
 
 
+def _green(number: str, axis: str) -> str:
+    """Return the pattern of a Green strain along one of two axes: `Green strain 1`, `Green-Lagrange strain E11`, `green_xx`."""
+    return rf".*green.*[ _.#-]e?[ _]?({number}{{1,2}}|{axis}{{1,2}})|e[ _]?({number}{number}|{axis}{axis})[ _-]green.*"
+
+
 def _place(axis: str) -> str:
     """Return the pattern of a coordinate: `x`, `pos_x`, `X-Position`, `x-Koordinate`."""
     return rf"{axis}|{axis}[ _-]?(pos|coord|koord)\w*|(pos|coord|koord)\w*[ _-]?{axis}"
@@ -30,6 +35,8 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "true_stress": r"true stress.*|cauchy.*|wahre spannung|contrainte vraie|(esfuerzo|tensi.n) (verdader|real).*",
     "log_strain": r"le[ _]?(11|xx)|true strain.*|log\w* strain|hencky.*|wahre dehnung|"
     r"d.formation (vraie|logarithmique)|deformaci.n (verdader|real|logar).*",
+    "green_strain_1": _green("1", "x"),
+    "green_strain_2": _green("2", "y"),
     "green_strain": r".*green.*(strain|lagrange|dehnung).*",
     "second_piola_stress": r"(.* )?(2nd|second|2\.) ?(piola|pk).*|(s_?)?pk ?(2|ii)( stress)?",
     "stretch_1": _axis("stretch|lambda", "λ|l", "1", "x") + "|f[ _]?(11|xx)",

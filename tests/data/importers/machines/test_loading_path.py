@@ -141,6 +141,27 @@ def test_two_axes(tmp_path):
     np.testing.assert_allclose(test.stress[1], [2 / 20e-6, 6 / 20e-6], rtol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("titles", "columns"),
+    [
+        ("Green-Lagrange strain E11 (%),Green-Lagrange strain E22", {}),
+        ("green_strain_xx [%],Green strain 2", {}),
+        ("E11 (%),E22", {"green_strain_1": "E11 (%)", "green_strain_2": "E22"}),
+    ],
+)
+def test_a_green_strain_along_each_of_two_axes(tmp_path, titles, columns):
+    grid = np.array([(a, b) for a in (1.1, 1.2, 1.3) for b in (0.95, 1.1, 1.25)])
+    rows = [f"{50 * (a * a - 1):.6f},{(b * b - 1) / 2:.8f},{a:.3f},{2 * b:.3f}" for a, b in grid]
+    path = write(tmp_path / "cross.csv", [f"{titles},Stress 1 (MPa),Stress 2 (MPa)", *rows])
+    if columns:
+        with pytest.raises(UserError, match=r"'E11.*' may be a Green or an engineering strain: give --columns\.green_strain_1"):
+            neuido.import_file(path, None, mode="biaxial")
+    neuido.import_file(path, tmp_path / "out", mode="biaxial", columns=columns)
+    (test,) = neuido.read_material_tests(tmp_path / "out").tests
+    np.testing.assert_allclose(test.path, grid, atol=1e-6)
+    np.testing.assert_allclose(test.stress, 1e6 * grid * [1, 2], rtol=1e-5)
+
+
 def test_a_strain_in_percent_without_a_unit_is_asked_for(tmp_path):
     path = write(tmp_path / "a.csv", ["Strain,Stress (MPa)", *(f"{100 * e:.4f},{3 * e:.6f}" for e in SHEET)])
     with pytest.raises(UserError, match=r"'Strain' has no unit: give --units\.strain percent"):
