@@ -1,9 +1,11 @@
 """Warp kernels of the contact between grid nodes and solids, with hand-written adjoints.
 
-A node at signed distance phi of a solid takes the share s(phi) of the contact: all of it inside, less of it up to one cell outside. The
-share makes the motion a smooth function of the pose, so that it has gradients. Outside a solid it acts as a drag: within some hundred
-substeps a body at rest comes to lie on the nodes inside, so its resting place is as coarse as the grid. The kinds of contact are those of
-`contact`, for the velocity relative to the solid's own at the node. What a node loses, the solid receives.
+A solid of the kind `separate` gives a node the impulse of `multibody.press_kernels`, along N, and Coulomb's friction within its cone;
+the velocity at which they part is at most `PARTING` cells a substep, if the node came no faster.
+
+A node at signed distance phi of a solid of the kinds `sticky` and `slip`, which hold the body, takes the share s(phi) of the contact: all
+of it inside, less of it up to one cell outside. The share makes the motion a smooth function of the pose, so that it has gradients.
+Velocities are relative to the solid's own at the node. What a node loses, the solid receives.
 
 The loop over solids carries a velocity. The adjoint recomputes it before each solid, as in `mpm.kernels.grid`.
 """
@@ -19,6 +21,11 @@ from neuido.physics.colliders.contact import SEPARATE, SLIP
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
+PARTING = 0.125
+"""Relative velocity up to which overlapping bodies are driven apart [cells a substep]; a pressure wave makes less than one. Like the other
+constants of contact it is a binary fraction, which float32 has exactly."""
+DAMPING = 0.0625
+"""Share of their normal relative velocity that touching bodies lose in a substep, so that a body which lands comes to rest."""
 STATE, TWIST, BODY = 13, 6, 10
 """Numbers of a solid's state (position, quaternion w x y z, velocity, angular velocity), of its twist, and of its mass and inertia."""
 
@@ -79,17 +86,42 @@ def build(real: type) -> SimpleNamespace:
         return vec3(real(t[3]), real(t[4]), real(t[5]))
 
     @func
+    def push_of(given: real, wn: real, cell: real):
+        """Return the change of the normal velocity for the impulse by mass that is given; wn is that before, cell a cell a substep."""
+        return wp.max(real(0.0), wp.min(given - wp.static(real(DAMPING)) * wn, wp.static(real(PARTING)) * cell - wn))
+
+    @func
+    def pressed_change(w: vec3, n: vec3, given: real, cell: real, friction: real):
+        """Return the change of the relative velocity w of a node that a solid presses along n."""
+        wn = wp.dot(w, n)
+        push = push_of(given, wn, cell)
+        t = w - wn * n
+        speed = wp.length(t)
+        out = push * n
+        if push > real(0.0):
+            if speed < friction * push:
+                out = out - t
+            else:
+                out = out - (friction * push / wp.max(speed, real(1.0e-30))) * t
+        return out
+
+    @func
     def after(
         u: vec3, x: vec3, h: real, s: int, c: int, step: int, state: wp.array3d(dtype=state_vec), twist: wp.array3d(dtype=twist_vec),
         body: wp.array2d(dtype=body_vec), friction: wp.array2d(dtype=wp.float64), shape: wp.array2d(dtype=wp.int32),
         kind: wp.array2d(dtype=wp.int32), size: wp.array2d(dtype=vec4), reach: wp.array2d(dtype=real), info: wp.array2d(dtype=wp.vec4i),
-        samples: wp.array(dtype=vec4),
+        samples: wp.array(dtype=vec4), pressed: vec3, m: real, dt: real,
     ):  # fmt: skip
         """Return the velocity of a node after the contact with solid c, from the velocity u before."""
         out = u
         st = state[step, s, c]
         r = arm_of(st, x)
-        if kind[s, c] > 0 and wp.length(r) < reach[s, c] + h:
+        if kind[s, c] == wp.static(SEPARATE):
+            P = wp.length(pressed)
+            if P > real(0.0):
+                t = twist_of(st, twist, body, step, s, c)
+                out = u + pressed_change(u - linear(t) - wp.cross(angular(t), r), pressed / P, P / m, h / dt, real(friction[s, c]))
+        elif kind[s, c] > 0 and wp.length(r) < reach[s, c] + h:
             q = turn_of(st)
             at = distance(shape[s, c], size[s, c], samples, info[s, c], wp.quat_rotate_inv(q, r))
             if at[3] < h:
@@ -117,6 +149,8 @@ def build(real: type) -> SimpleNamespace:
         reach: wp.array2d(dtype=real),
         info: wp.array2d(dtype=wp.vec4i),
         samples: wp.array(dtype=vec4),
+        dt: wp.array(dtype=real),
+        pressed: wp.array2d(dtype=vec3),
         grid: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
         impulse: wp.array3d(dtype=twist_vec),
@@ -133,7 +167,9 @@ def build(real: type) -> SimpleNamespace:
             changed = bool(False)
             for c in range(kind.shape[1]):
                 u = out
-                out = after(u, x, h, s, c, step, state, twist, body, friction, shape, kind, size, reach, info, samples)
+                out = after(
+                    u, x, h, s, c, step, state, twist, body, friction, shape, kind, size, reach, info, samples, pressed[node, c], m, dt[s]
+                )
                 J = m * (u - out)
                 if wp.length_sq(J) > real(0.0):
                     changed = True
@@ -147,22 +183,25 @@ def build(real: type) -> SimpleNamespace:
                 velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
 
     @func
-    def normal_adjoint(v: vec3, n: vec3, kind: int, friction: real, a: vec3):
+    def before(
+        start: vec3, x: vec3, h: real, s: int, c: int, step: int, state: wp.array3d(dtype=state_vec), twist: wp.array3d(dtype=twist_vec),
+        body: wp.array2d(dtype=body_vec), friction: wp.array2d(dtype=wp.float64), shape: wp.array2d(dtype=wp.int32),
+        kind: wp.array2d(dtype=wp.int32), size: wp.array2d(dtype=vec4), reach: wp.array2d(dtype=real), info: wp.array2d(dtype=wp.vec4i),
+        samples: wp.array(dtype=vec4), pressed: wp.array2d(dtype=vec3), m: real, dt: real, node: int,
+    ):  # fmt: skip
+        """Return the velocity of a node before the contact with solid c, from the velocity before all."""
+        u = start
+        for e in range(c):
+            u = after(u, x, h, s, e, step, state, twist, body, friction, shape, kind, size, reach, info, samples, pressed[node, e], m, dt)
+        return u
+
+    @func
+    def normal_adjoint(v: vec3, n: vec3, kind: int, a: vec3):
         """Return the adjoint of n from the adjoint a of the result of `contact`."""
         vn = wp.dot(v, n)
         out = vec3(real(0.0), real(0.0), real(0.0))
         if kind == wp.static(SLIP):
             out = -vn * a - wp.dot(a, n) * v
-        elif kind == wp.static(SEPARATE):
-            if vn < real(0.0):
-                t = v - vn * n
-                speed = wp.length(t)
-                if speed >= -friction * vn:
-                    size = wp.max(speed, real(1.0e-30))
-                    e = t / size
-                    ea = wp.dot(e, a)
-                    at = a + (friction * vn / size) * (a - ea * e)
-                    out = -vn * at + (friction * ea - wp.dot(at, n)) * v
         return out
 
     @func
@@ -197,6 +236,8 @@ def build(real: type) -> SimpleNamespace:
         reach: wp.array2d(dtype=real),
         info: wp.array2d(dtype=wp.vec4i),
         samples: wp.array(dtype=vec4),
+        dt: wp.array(dtype=real),
+        pressed: wp.array2d(dtype=vec3),
         grid: wp.array(dtype=vec4),
         free: wp.array(dtype=vec4),
         a_velocity: wp.array(dtype=vec4),
@@ -204,8 +245,9 @@ def build(real: type) -> SimpleNamespace:
         a_state: wp.array3d(dtype=state_vec),
         a_twist: wp.array3d(dtype=twist_vec),
         a_friction: wp.array2d(dtype=wp.float64),
+        a_pressed: wp.array2d(dtype=vec3),
     ):
-        """Turn a_velocity into the adjoint before the contact, with that of the node's mass last; add to the other adjoints.
+        """Turn a_velocity into the adjoint before the contact, with that of the node's mass last; write a_pressed; add to the others.
 
         `free` has the velocities before the contact.
         """
@@ -225,14 +267,79 @@ def build(real: type) -> SimpleNamespace:
                 c = count - 1 - r_c
                 st = state[step, s, c]
                 r = arm_of(st, x)
-                if kind[s, c] > 0 and wp.length(r) < reach[s, c] + h:
+                P = wp.length(pressed[node, c])
+                a_pressed[node, c] = vec3(real(0.0), real(0.0), real(0.0))
+                if kind[s, c] == wp.static(SEPARATE):
+                    if P > real(0.0):
+                        u = before(
+                            start, x, h, s, c, step, state, twist, body, friction, shape, kind, size, reach, info, samples, pressed, m,
+                            dt[s], node
+                        )  # fmt: skip
+                        t = twist_of(st, twist, body, step, s, c)
+                        spin = angular(t)
+                        w = u - linear(t) - wp.cross(spin, r)
+                        n = pressed[node, c] / P
+                        mu = real(friction[s, c])
+                        given = P / m
+                        wn = wp.dot(w, n)
+                        push = push_of(given, wn, h / dt[s])
+                        moved = pressed_change(w, n, given, h / dt[s], mu)
+                        ai = a_impulse[step, s, c]
+                        aL = vec3(real(ai[3]), real(ai[4]), real(ai[5]))
+                        aJ = vec3(real(ai[0]), real(ai[1]), real(ai[2])) + wp.cross(aL, r)
+                        ar = wp.cross(-m * moved, aL)
+                        a_mass = a_mass - wp.dot(moved, aJ)
+                        a_moved = a - m * aJ
+                        aw = vec3(real(0.0), real(0.0), real(0.0))
+                        if push > real(0.0):
+                            a_push = wp.dot(n, a_moved)
+                            an = push * a_moved
+                            along = w - wn * n
+                            speed = wp.length(along)
+                            at_ = -a_moved
+                            if speed >= mu * push:
+                                safe = wp.max(speed, real(1.0e-30))
+                                e = along / safe
+                                ea = wp.dot(e, a_moved)
+                                at_ = (-mu * push / safe) * (a_moved - ea * e)
+                                a_push -= mu * ea
+                                wp.atomic_add(a_friction, s, c, -wp.float64(push * ea))
+                            aw = at_ - wp.dot(at_, n) * n
+                            an = an - wp.dot(at_, n) * w - wn * at_
+                            ap = real(0.0)
+                            if given - wp.static(real(DAMPING)) * wn < wp.static(real(PARTING)) * h / dt[s] - wn:
+                                ap = a_push / m
+                                aw = aw - wp.static(real(DAMPING)) * a_push * n
+                                an = an - wp.static(real(DAMPING)) * a_push * w
+                                a_mass = a_mass - a_push * given / m
+                            else:
+                                aw = aw - a_push * n
+                                an = an - a_push * w
+                            a_pressed[node, c] = ap * n + (an - wp.dot(n, an) * n) / P
+                        a = a + aw
+                        ar = ar + wp.cross(spin, aw)
+                        a_spin = -wp.cross(r, aw)
+                        of_twist = twist_vec()
+                        of_state = state_vec()
+                        for k in range(3):
+                            of_state[k] = -wp.float64(ar[k])
+                            of_twist[k] = -wp.float64(aw[k])
+                            of_twist[3 + k] = wp.float64(a_spin[k])
+                        if body[s, c][0] > wp.float64(0.0):
+                            for k in range(6):
+                                of_state[7 + k] = of_twist[k]
+                        else:
+                            wp.atomic_add(a_twist, wp.min(step, twist.shape[0] - 1), s, c, of_twist)
+                        wp.atomic_add(a_state, step, s, c, of_state)
+                elif kind[s, c] > 0 and wp.length(r) < reach[s, c] + h:
                     q = turn_of(st)
                     y = wp.quat_rotate_inv(q, r)
                     at = distance(shape[s, c], size[s, c], samples, info[s, c], y)
                     if at[3] < h:
-                        u = start
-                        for e in range(c):
-                            u = after(u, x, h, s, e, step, state, twist, body, friction, shape, kind, size, reach, info, samples)
+                        u = before(
+                            start, x, h, s, c, step, state, twist, body, friction, shape, kind, size, reach, info, samples, pressed, m,
+                            dt[s], node
+                        )  # fmt: skip
                         t = twist_of(st, twist, body, step, s, c)
                         spin = angular(t)
                         local = vec3(at[0], at[1], at[2])
@@ -253,7 +360,7 @@ def build(real: type) -> SimpleNamespace:
                         a_phi = slope[1] * wp.dot(change, a - m * aJ)
                         b = contact_adjoint(w, n, kind[s, c], mu, a_change)
                         aw = vec3(b[0], b[1], b[2]) - a_change
-                        an = normal_adjoint(w, n, kind[s, c], mu, a_change)
+                        an = normal_adjoint(w, n, kind[s, c], a_change)
                         a = a + aw
                         ar = ar + wp.cross(spin, aw)
                         a_spin = -wp.cross(r, aw)
@@ -274,7 +381,6 @@ def build(real: type) -> SimpleNamespace:
                         else:
                             wp.atomic_add(a_twist, wp.min(step, twist.shape[0] - 1), s, c, of_twist)
                         wp.atomic_add(a_state, step, s, c, of_state)
-                        wp.atomic_add(a_friction, s, c, wp.float64(b[3]))
             a_velocity[node] = vec4(a[0], a[1], a[2], a_mass)
 
     return SimpleNamespace(meet=meet, meet_adjoint=meet_adjoint)

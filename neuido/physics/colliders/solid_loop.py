@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from neuido.physics.colliders import rigid_motion, solid_contact
-from neuido.physics.colliders.contact import CONTACTS
+from neuido.physics.colliders.contact import CONTACTS, SEPARATE
 from neuido.physics.colliders.solid_contact import STATE, TWIST
 from neuido.physics.colliders.solid_tables import SolidInputs, SolidTable
 from neuido.physics.colliders.tables import ColliderTable
+from neuido.physics.multibody import press_kernels
 from neuido.physics.runtime.device import launch, launch_adjoint, real_of
 
 assert CONTACTS["sticky"] == 1  # as `rigid_motion.push` has it
@@ -67,6 +68,8 @@ class SolidLoop:
         real = real_of(dx.dtype)
         self.contact, self.motion = solid_contact.build(real), rigid_motion.build(real)
         self.device, self.count = dx.device, table.kind.numel()
+        self.presses = press_kernels.build(real) if bool((table.kind == SEPARATE).any()) else None
+        self.pressed, self.a_pressed = (dx.new_empty(0, table.kind.shape[1], 3) for _ in range(2))
         self.touching = self.count * table.points.shape[2] * planes.kind.shape[1]
 
     def begin(self) -> None:
@@ -78,9 +81,39 @@ class SolidLoop:
     def _contact_inputs(self, n: int, index: Tensor) -> list:
         t = self.table
         return [n, self.origin, self.dx, index, self.tape.state, self.twist, self.body, self.friction,
-                t.shape, t.kind, t.size, t.reach, t.info, t.samples]  # fmt: skip
+                t.shape, t.kind, t.size, t.reach, t.info, t.samples, self.dt]  # fmt: skip
 
-    def meet(self, n: int, index: Tensor, grid: Tensor, velocity: Tensor, impulse: Tensor | None = None) -> None:
+    def clear(self, nodes: int) -> None:
+        """Zero the impulses of `press` on the nodes, of which there are so many."""
+        if len(self.pressed) != nodes:
+            self.pressed = self.dx.new_zeros(nodes, self.table.kind.shape[1], 3)
+        elif self.presses is not None:
+            self.pressed.zero_()
+
+    def press(self, n: int, particles: list) -> None:
+        """Add the impulses of the solids of the kind `separate` on the nodes in substep n.
+
+        Args:
+            n: Number of the substep.
+            particles: Field, scene, origin, cell size and substep of each field, position [m], volume [m^3] and mass [kg] of the particles,
+                and the nodes along each axis.
+        """
+        if self.presses is not None:
+            launch(self.presses.press, len(particles[0]), [*self._press_inputs(n, particles), self.pressed], self.device)
+
+    def _press_inputs(self, n: int, particles: list) -> list:
+        t = self.table
+        return [n, *particles, self.tape.state, t.shape, t.kind, t.size, t.reach, t.info, t.samples]
+
+    def press_adjoint(self, n: int, particles: list, a_x: Tensor, a_mass: Tensor) -> None:
+        """Compute the adjoint of `press`, after `meet_adjoint`; adds to the adjoints of positions and masses."""
+        if self.presses is not None:
+            arguments = [*self._press_inputs(n, particles), self.a_pressed, self.a_state, a_x, a_mass]
+            launch(self.presses.press_adjoint, len(particles[0]), arguments, self.device)
+
+    def meet(
+        self, n: int, index: Tensor, grid: Tensor, velocity: Tensor, reach: slice = slice(None), impulse: Tensor | None = None
+    ) -> None:
         """Bring the nodes in contact with the solids in substep n.
 
         Args:
@@ -88,10 +121,11 @@ class SolidLoop:
             index: Indices and scene of each node, (nodes, 4).
             grid: Momentum and mass, (nodes, 4).
             velocity: Velocity, (nodes, 4); changed in place.
+            reach: Which of all nodes these are.
             impulse: Receives what the nodes lose; by default the record.
         """
         impulse = self.tape.impulse if impulse is None else impulse
-        launch(self.contact.meet, len(grid), [*self._contact_inputs(n, index), grid, velocity, impulse], self.device)
+        launch(self.contact.meet, len(grid), [*self._contact_inputs(n, index), self.pressed[reach], grid, velocity, impulse], self.device)
 
     def _push_inputs(self, n: int) -> list:
         t = self.table
@@ -148,8 +182,11 @@ class SolidLoop:
             free: Velocities before the contact, (nodes, 4).
             a_velocity: Adjoint of the velocities; turned into that before the contact, with the adjoint of the node's mass last.
         """
+        if self.a_pressed.shape != self.pressed.shape:
+            self.a_pressed = torch.empty_like(self.pressed)
         arguments = [
             *self._contact_inputs(n, index),
+            self.pressed,
             grid,
             free,
             a_velocity,
@@ -157,6 +194,7 @@ class SolidLoop:
             self.a_state,
             self.a_twist,
             self.a_own_friction,
+            self.a_pressed,
         ]
         launch(self.contact.meet_adjoint, len(grid), arguments, self.device)
 

@@ -25,7 +25,17 @@ from neuido.physics.mpm.plan import (
     attachment_loop,
     solid_loop,
 )
-from neuido.physics.mpm.rollout import Tape, flow_inputs, grid_inputs, meet, stress, stress_inputs, swell, to_grid, update_nodes
+from neuido.physics.mpm.rollout import (
+    Tape,
+    flow_inputs,
+    grid_inputs,
+    meet,
+    stress,
+    stress_inputs,
+    swell,
+    to_grid,
+    update_nodes,
+)
 from neuido.physics.runtime.device import real_of, torch_stream
 
 
@@ -82,6 +92,8 @@ def run_backward(
             v_free = v_in
             v_in = v_in if attached is None else attached.hold(n, x, v_in, spare=True)
             v_first, mass_in = v_in, mass
+            if solids is not None:
+                solids.clear(setup.room.count)
             tau, grid, met, velocity = recompute(plan, inputs, tape, n, state, (v_in, C_in), elastic, material, scratch, solids)
             if setup.leaving is not None:
                 v_in, mass_in = setup.leaving.entered(v_first, mass)
@@ -111,6 +123,7 @@ def run_backward(
                 update_nodes(plan, met, at_step(pull, n), force, friction, free)
                 solids.advance_adjoint(n)
                 solids.meet_adjoint(n, setup.room.index, met, free, a_velocity)
+                solids.press_adjoint(n, plan.pressed(x, mass_in), a_x, a_mass)
             arguments = [met, a_velocity, a_grid, at_step(a_pull, n), a_force, a_friction, parameters, False]
             inputs_n = grid_inputs(plan, at_step(pull, n), force, friction)
             plan.launch(k.update_grid_adjoint, setup.room.count // setup.room.chunk, [*inputs_n, *arguments])
@@ -185,11 +198,13 @@ def recompute(
         v_in, mass = setup.leaving.enter(x, v_in, mass, tau)
     grid = to_grid(plan, x, v_in, C_in, tau, mass, setup.room.scratch("grid")) if tape.grid is None else tape.grid[n]
     met = meet(plan, x, grid, inputs[BODY_FRICTION])
+    if solids is not None:
+        solids.press(n, plan.pressed(x, mass))
     velocity = setup.room.scratch("velocity") if tape.velocity is None else tape.velocity[n]
     if tape.velocity is None:
         update_nodes(plan, met, at_step(pull, n), force, friction, velocity)
         if solids is not None:
-            solids.meet(n, setup.room.index, met, velocity, solids.spare)
+            solids.meet(n, setup.room.index, met, velocity, impulse=solids.spare)
     return tau, grid, met, velocity
 
 

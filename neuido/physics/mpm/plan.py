@@ -146,6 +146,12 @@ class Plan:
         stiffness, growth, material, branches, flow = (t if t.numel() else None for t in given)
         return Material(stiffness, growth, material, branches, flow, all_branches)
 
+    def pressed(self, x: Tensor, mass: Tensor) -> list:
+        """Return the particles as `SolidLoop.press` takes them, at x [m] with their masses [kg]."""
+        own = self.setup
+        fields = [own.field, own.particles.scene, own.field_origin, own.field_dx, own.field_dt]
+        return [*fields, x, own.sorted_volume, mass, own.room.size]
+
     def spin_decay(self, inputs: Sequence[Tensor]) -> SpinDecay | None:
         """Return the launches of the torque of `Effects.spin_decay`; None without it."""
         setup = self.setup

@@ -140,9 +140,9 @@ def substep(
             half = 0.5 * volume.pow(1 / 3).repeat_interleave(27)
             table = sim.setup.contact.friction[s].reshape(sim.setup.contact.bodies, -1)  # type: ignore[union-attr]
             arms = (flat, -arm.detach().reshape(-1, 3), half)
-            grid_p = exchange(grid_p.reshape(fields, size, 3), grid_m.reshape(fields, size), gradient, table, arms, float(dx)).reshape(
-                -1, 3
-            )
+            grid_p = exchange(
+                grid_p.reshape(fields, size, 3), grid_m.reshape(fields, size), gradient, table, arms, float(dx), float(dt)
+            ).reshape(-1, 3)
         full = grid_m > 0
         u = grid_p / torch.where(full, grid_m, 1.0)[:, None]
         index = torch.cartesian_prod(*[torch.arange(n, device=sim.device) for n in shape])

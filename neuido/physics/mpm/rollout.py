@@ -136,7 +136,9 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
                 material, pull_now = plan.material(inputs, n, all_branches=tape.whole), at_step(pull, n)
             if not clears:
                 grid.zero_()
-            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped, attached, n)
+            if solids is not None:
+                solids.clear(setup.room.count)
+            to_nodes = partial(scatter, plan, inputs, now, material, elastic, tau, grid, spin, damped, attached, n, solids)
             met = grid if setup.contact is None else setup.room.scratch("met")
             on_nodes = partial(update_nodes, plan, met, pull_now, force, friction, velocity, reach, clears, solids, n)
             shrinkage = at_step(inputs[SHRINKAGE], n)
@@ -167,6 +169,7 @@ def scatter(
     damped: tuple[Tensor, Tensor] | None = None,
     attached: AttachmentLoop | None = None,
     n: int = 0,
+    solids: SolidLoop | None = None,
 ) -> None:
     """Compute the stress, and add momentum and mass of the particles to the nodes (P2G); let bodies that meet exchange momentum.
 
@@ -182,6 +185,7 @@ def scatter(
         damped: Memory for v and C after that torque.
         attached: The launches of attachments, or None.
         n: Number of the substep.
+        solids: The launches of solids, or None.
     """
     x, v, C, F, history = now
     stress(plan, elastic, F, C, history, inputs[STATES + 4], material, tau)
@@ -194,6 +198,8 @@ def scatter(
         v, mass = plan.setup.leaving.enter(x, v, mass, tau)
     add_to_grid(plan, x, v, C, tau, mass, grid)
     meet(plan, x, grid, inputs[BODY_FRICTION])
+    if solids is not None:
+        solids.press(n, plan.pressed(x, mass))
 
 
 def meet(plan: Plan, x: Tensor, grid: Tensor, friction: Tensor) -> Tensor:
@@ -394,7 +400,7 @@ def update_nodes(
     inputs = [*grid_inputs(plan, pull, force, friction, reach), grid[reach], velocity[reach], clear]
     plan.launch(setup.kernels.update_grid, len(grid[reach]) // setup.room.chunk, inputs)
     if solids is not None:
-        solids.meet(n, setup.room.index[reach], grid[reach], velocity[reach])
+        solids.meet(n, setup.room.index[reach], grid[reach], velocity[reach], reach)
         solids.advance(n)
 
 

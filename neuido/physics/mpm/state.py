@@ -205,7 +205,7 @@ class Setup:
                 pairs = contact_kernels.build(real_of(self.dtype), stencil.functions)
                 frictions = friction_table(self.scenes, self.bodies)
                 counts = self.field_counts.tolist()
-                nodes.contact = ContactGrid(counts, pairs, nodes.size, nodes.chunk, self.dx, frictions, self.device, self.dtype)
+                nodes.contact = ContactGrid(counts, pairs, nodes.size, nodes.chunk, self.dx, self.dt, frictions, self.device, self.dtype)
             self._rooms[shape] = nodes
         return self._rooms[shape]
 

@@ -1,10 +1,10 @@
 """Contact between bodies that have a velocity field each: one momentum exchange on the grid a substep.
 
 The fields of a scene lie one after the other in the arrays of the grid. At a node that several bodies reach, each pair of bodies whose
-surfaces touch and that approach exchanges momentum (Bardenhagen, Brackbill and Sulsky 2000): the normal part of their relative velocity
-goes, and of the tangential part what Coulomb's law allows. The impulse on the one is minus that on the other, so momentum is kept to
-rounding. Surfaces touch where particles of the two meet along the common normal (a gap of zero), not where their weights overlap: bodies
-would else be held about a cell apart. `contact_kernels` has the kernels and their adjoints.
+surfaces overlap exchanges momentum: a stiff spring pushes along the common normal, and of the tangential part of their relative velocity
+goes what Coulomb's law allows. The impulse on the one is minus that on the other, so momentum is kept to rounding. Surfaces overlap
+where particles of the two do along the normal, not where their weights do: bodies would else be held about a cell apart. `contact_kernels`
+and `reach_kernels` have the kernels and their adjoints.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,6 +29,7 @@ class ContactGrid:
         nodes: Grid nodes along each axis, padding included.
         chunk: Nodes that a thread handles.
         dx: Cell size of each scene [m], (S,).
+        dt: Substep of each scene [s], (S,).
         friction: `friction_table` of the scenes.
         device: Device of the arrays.
         dtype: Scalar type of the arrays.
@@ -45,11 +46,12 @@ class ContactGrid:
         nodes: wp.vec3i,
         chunk: int,
         dx: Tensor,
+        dt: Tensor,
         friction: Tensor,
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.kernels, self.dx = kernels, dx
+        self.kernels, self.dx, self.dt = kernels, dx, dt
         self.nodes, self.chunk = nodes, chunk
         self.size = nodes[0] * nodes[1] * nodes[2]
         self.first = torch.tensor([0, *accumulate(counts)], dtype=torch.int32, device=device)
@@ -57,7 +59,8 @@ class ContactGrid:
         self.scenes, fields, self.bodies = len(counts), sum(counts), round(friction.shape[1] ** 0.5)
         self.shared = torch.zeros(self.scenes * self.size, dtype=torch.int32, device=device)
         self.gradient, self.a_gradient = (torch.zeros(fields * self.size, 3, dtype=dtype, device=device) for _ in range(2))
-        self.reach = torch.zeros(fields * self.size, 2 * self.bodies, dtype=dtype, device=device)
+        self.reach = torch.zeros(fields * self.size, 4 * self.bodies, dtype=dtype, device=device)
+        self.of_adjoint: tuple[Tensor, Tensor] | None = None
 
     def frictions(self, given: Tensor | float | None) -> Tensor:
         """Return the friction of each pair for a rollout, (S, B B).
@@ -122,11 +125,18 @@ class ContactGrid:
             a_x: Adjoint of the positions; added to.
             a_friction: Adjoint of the friction; added to.
         """
-        k, threads = self.kernels, self.scenes * self.size // self.chunk
-        launch(k.exchange_adjoint, threads, [*self._table(friction), grid, a_out, a_grid, self.a_gradient, a_friction])
-        launch(k.add_gradients_adjoint, len(particles[0]), [*particles, self.nodes, self.shared, self.a_gradient, a_x])
+        k, threads, count = self.kernels, self.scenes * self.size // self.chunk, len(particles[0])
+        if self.of_adjoint is None:
+            a_reach = torch.zeros(len(self.reach), 2 * self.bodies, dtype=self.reach.dtype, device=self.reach.device)
+            self.of_adjoint = a_reach, torch.zeros_like(a_reach, dtype=torch.int32)
+        a_reach, owner = self.of_adjoint
+        launch(k.exchange_adjoint, threads, [*self._table(friction), grid, a_out, a_grid, self.a_gradient, a_reach, owner, a_friction])
+        at_nodes = [self.nodes, self.first, self.shared, self.gradient]
+        launch(k.find_owner, count, [*particles, *at_nodes, self.reach, a_reach, owner])
+        launch(k.find_reach_adjoint, count, [*particles[:5], *at_nodes, a_reach, owner, self.a_gradient, a_x])
+        launch(k.add_gradients_adjoint, count, [*particles, self.nodes, self.shared, self.a_gradient, a_x])
         return a_grid
 
     def _table(self, friction: Tensor) -> list:
         """Return the first arguments of the kernel of the exchange and of its adjoint."""
-        return [self.first, self.size, self.chunk, self.bodies, self.dx, friction, self.shared, self.gradient, self.reach]
+        return [self.first, self.size, self.chunk, self.bodies, self.dx, self.dt, friction, self.shared, self.gradient, self.reach]

@@ -1,17 +1,19 @@
 """Warp kernels of the contact between bodies with a velocity field each, with hand-written adjoints.
 
 At a node i, body f has the momentum p, the mass m, and the volume gradient G = sum_p V_p grad w_ip, which points into it and does not
-depend on its density. The normal from a to b is G_b - G_a, normalised, or G_b or -G_a where one of these separates the particles of the two
-around the node better by `BETTER`, as the separating axis of two convex bodies does. (At the edge of a block that slides on a plane the
-gradient of the block is that of two faces; with the tilted mean the edge would plough.) Each pair that touches along the normal and
-approaches receives
+depend on its density. The normal n from a to b is G_b - G_a, normalised, or G_b or -G_a where one of these separates the particles of the
+two around the node better by `BETTER`, as the separating axis of two convex bodies does. (At the edge of a block that slides on a plane
+the gradient of the block is that of two faces; with the tilted mean the edge would plough.) Each pair that overlaps by o along the normal
+(`reach_kernels`) receives
 
     J_a = -J_b = (m_a m_b / M) (r' - r),   r = v_a - v_b,   M: mass of all bodies at the node,
+    r' - r = -P n - min(mu P, |t|) t / |t|,   t = r - (r n) n,   P = PUSH o / dt + DAMPING (r n),
 
-where r' is r after contact with Coulomb's friction. For two bodies this is the impulse that makes their velocities agree. With M
-in place of m_a + m_b the impulses of several pairs at a node, all computed from the velocities before, dissipate too.
+a spring that gives back nearly all that it took, with Coulomb's friction. (An impulse that ends the approach of a node at once is
+inelastic.) With M in place of m_a + m_b the impulses of several pairs at a node are stable too. P is limited so that bodies which overlap
+from the start part by `PARTING` cells a substep at most.
 
-The loops over the 27 nodes of a particle are not unrolled, which would take a minute to compile. Whether a pair touches is a branch, and
+The loops over the 27 nodes of a particle are not unrolled, which would take a minute to compile. Which axis is the normal is a branch, and
 has no derivative. A node belongs to one thread, which visits its pairs one after the other.
 """
 
@@ -21,14 +23,18 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.colliders.solid_contact import DAMPING, PARTING
+from neuido.physics.multibody import reach_kernels
+from neuido.physics.multibody.reach_kernels import FAR
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
-FAR = -1.0e30
-"""Reach of a body without particles near a node [m]."""
 BETTER = 0.1
 """Overlap along an axis that makes another one the normal [cells]. The gradients of evenly filled bodies turn by some degrees from node to
 node, which moves an overlap by less; their mean turns less than each."""
+PUSH = 0.1875
+"""Share of an overlap that the contact takes back in a substep; at 1 an explicit spring would be unstable. With half of it bodies sink in
+twice as deep."""
 
 
 @cached
@@ -40,7 +46,6 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
         stencil: Returns the functions of the transfers' weights (`mpm.stencil.functions`).
     """
     start_warp()
-    vec2 = wp.types.vector(length=2, dtype=real)
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
     name = f"neuido.contact.{real.__name__}"
@@ -159,87 +164,43 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                 sz += xz * a[0] + yz * a[1] + wx[i] * wy[j] * bend[k] * a[2]
         a_x[p] = a_x[p] - (volume[p] / (h * h)) * vec3(sx, sy, sz)
 
-    @kernel
-    def find_reach(
-        field: wp.array(dtype=wp.int32),
-        scene: wp.array(dtype=wp.int32),
-        origin: wp.array(dtype=vec3),
-        dx: wp.array(dtype=real),
-        x: wp.array(dtype=vec3),
-        volume: wp.array(dtype=real),
-        nodes: wp.vec3i,
-        first: wp.array(dtype=wp.int32),
-        shared: wp.array(dtype=wp.int32),
-        gradient: wp.array(dtype=vec3),
-        reach: wp.array2d(dtype=real),
-    ):
-        """Find how far the particles of a body extend beyond each shared node [m]: out of itself, and into each other body.
-
-        Column c of `reach` is along the gradient of body c of the scene, column B + c along the mean of it and that of the body itself, B
-        bodies in all. A particle extends by half its edge, the cube root of its volume.
-        """
-        p = wp.tid()
-        f = field[p]
-        s = scene[p]
-        h = dx[f]
-        base = first_node((x[p] - origin[f]) / h, nodes)
-        size = nodes[0] * nodes[1] * nodes[2]
-        local = flat_index(0, base, nodes)
-        half = real(0.5) * wp.pow(volume[p], real(1.0 / 3.0))
-        for c in range(27):
-            i = c // 9
-            j = c // 3 % 3
-            k = c % 3
-            row = local + (i * nodes[1] + j) * nodes[2] + k
-            if shared[s * size + row] > 1:
-                arm = x[p] - (origin[f] + vec3(real(base[0] + i), real(base[1] + j), real(base[2] + k)) * h)
-                for g in range(first[s], first[s + 1]):
-                    d = gradient[g * size + row]
-                    length = wp.length(d)
-                    if length > real(0.0):
-                        along = wp.dot(d, arm) / length
-                        if g == f:
-                            along = -along
-                        wp.atomic_max(reach, f * size + row, g - first[s], along + half)
-                    d = d - gradient[f * size + row]
-                    length = wp.length(d)
-                    if length > real(0.0):
-                        wp.atomic_max(reach, f * size + row, reach.shape[1] / 2 + g - first[s], wp.dot(d, arm) / length + half)
-
     @func
     def sides(a: int, b: int, begin: int, at: int, size: int, tolerance: real, reach: wp.array2d(dtype=real)):
-        """Return the factors of the gradients of a and b in the normal from a to b at a node; zero where the bodies do not touch."""
+        """Return the factors of the gradients of a and b in the normal from a to b at a node, and the overlap; zero without one."""
         ra = a * size + at
         rb = b * size + at
-        half = reach.shape[1] / 2
+        n = reach.shape[1] / 4
         by_a = reach[ra, a - begin] + reach[rb, a - begin]
         by_b = reach[ra, b - begin] + reach[rb, b - begin]
-        overlap = reach[ra, half + b - begin] + reach[rb, half + a - begin]
-        out = vec2(real(-1.0), real(1.0))
-        least = overlap - tolerance
+        least = reach[ra, n + b - begin] + reach[rb, n + a - begin] - tolerance
+        out = vec3(real(-1.0), real(1.0), reach[ra, 3 * n + b - begin] + reach[rb, 3 * n + a - begin])
         if by_a < least and by_a > wp.static(real(0.5 * FAR)):
             least = by_a
-            overlap = by_a
-            out = vec2(real(-1.0), real(0.0))
+            out = vec3(real(-1.0), real(0.0), reach[ra, 2 * n + a - begin] + reach[rb, 2 * n + a - begin])
         if by_b < least and by_b > wp.static(real(0.5 * FAR)):
-            overlap = by_b
-            out = vec2(real(0.0), real(1.0))
-        if overlap < real(0.0):
-            out = vec2(real(0.0), real(0.0))
+            out = vec3(real(0.0), real(1.0), reach[ra, 2 * n + b - begin] + reach[rb, 2 * n + b - begin])
+        if out[2] < real(0.0):
+            out = vec3(real(0.0), real(0.0), real(0.0))
         return out
 
     @func
-    def change(r: vec3, n: vec3, friction: real):
+    def push_of(overlap: real, rn: real, h: real, dt: real):
+        """Return the change of the normal relative velocity by the contact; rn is that before, positive where the bodies approach."""
+        return wp.max(
+            real(0.0), wp.min(wp.static(real(PUSH)) * overlap / dt + wp.static(real(DAMPING)) * rn, rn + wp.static(real(PARTING)) * h / dt)
+        )
+
+    @func
+    def change(r: vec3, n: vec3, friction: real, push: real):
         """Return the change of the relative velocity r by contact; n points from the first body to the second."""
-        rn = wp.dot(r, n)
-        out = vec3(real(0.0), real(0.0), real(0.0))
-        if rn > real(0.0):
-            t = r - rn * n
-            speed = wp.length(t)
-            if speed < friction * rn:
-                out = -r
+        t = r - wp.dot(r, n) * n
+        speed = wp.length(t)
+        out = -push * n
+        if push > real(0.0):
+            if speed < friction * push:
+                out = out - t
             else:
-                out = -rn * (n + (friction / wp.max(speed, real(1.0e-30))) * t)
+                out = out - (friction * push / wp.max(speed, real(1.0e-30))) * t
         return out
 
     @kernel
@@ -249,6 +210,7 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
         chunk: int,
         bodies: int,
         dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
         friction: wp.array2d(dtype=real),
         shared: wp.array(dtype=wp.int32),
         gradient: wp.array(dtype=vec3),
@@ -277,10 +239,12 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                         if length > real(0.0) and qa[3] > real(0.0) and qb[3] > real(0.0):
                             r = velocity_of(qa) / qa[3] - velocity_of(qb) / qb[3]
                             mu = friction[s, (a - first[s]) * bodies + b - first[s]]
-                            J = (qa[3] * qb[3] / total) * change(r, d / length, mu)
-                            push = vec4(J[0], J[1], J[2], real(0.0))
-                            out[a * size + node] = out[a * size + node] + push
-                            out[b * size + node] = out[b * size + node] - push
+                            n = d / length
+                            push = push_of(w[2], wp.dot(r, n), dx[s], dt[s])
+                            J = (qa[3] * qb[3] / total) * change(r, n, mu, push)
+                            given = vec4(J[0], J[1], J[2], real(0.0))
+                            out[a * size + node] = out[a * size + node] + given
+                            out[b * size + node] = out[b * size + node] - given
 
     @kernel
     def exchange_adjoint(
@@ -289,6 +253,7 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
         chunk: int,
         bodies: int,
         dx: wp.array(dtype=real),
+        dt: wp.array(dtype=real),
         friction: wp.array2d(dtype=real),
         shared: wp.array(dtype=wp.int32),
         gradient: wp.array(dtype=vec3),
@@ -297,9 +262,11 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
         a_out: wp.array(dtype=vec4),
         a_grid: wp.array(dtype=vec4),
         a_gradient: wp.array(dtype=vec3),
+        a_reach: wp.array2d(dtype=real),
+        owner: wp.array2d(dtype=wp.int32),
         a_friction: wp.array2d(dtype=real),
     ):
-        """Write a_grid and, at shared nodes, a_gradient; add to a_friction."""
+        """Write a_grid and, at shared nodes, a_gradient and a_reach; clear `owner` there; add to a_friction."""
         begin = wp.tid() * chunk
         for at in range(begin, begin + chunk):
             s = at // size
@@ -311,6 +278,9 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                 for f in range(first[s], first[s + 1]):
                     total += grid[f * size + node][3]
                     a_gradient[f * size + node] = vec3(real(0.0), real(0.0), real(0.0))
+                    for c in range(a_reach.shape[1]):
+                        a_reach[f * size + node, c] = real(0.0)
+                        owner[f * size + node, c] = -1
                 a_total = real(0.0)
                 for a in range(first[s], first[s + 1]):
                     qa = grid[a * size + node]
@@ -327,25 +297,46 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                             pair = (a - first[s]) * bodies + b - first[s]
                             mu = friction[s, pair]
                             rn = wp.dot(r, n)
-                            if rn > real(0.0):
+                            push = push_of(w[2], rn, dx[s], dt[s])
+                            if push > real(0.0):
                                 A = velocity_of(a_out[a * size + node]) - velocity_of(a_out[b * size + node])
                                 share = qa[3] * qb[3] / total
-                                a_share = wp.dot(A, change(r, n, mu))
+                                a_share = wp.dot(A, change(r, n, mu, push))
+                                A = share * A
                                 t = r - rn * n
                                 speed = wp.length(t)
-                                ar = -share * A
-                                if speed >= mu * rn:
+                                a_push = -wp.dot(n, A)
+                                an = -push * A
+                                at_ = -A
+                                if speed >= mu * push:
                                     safe = wp.max(speed, real(1.0e-30))
                                     e = t / safe
                                     eA = wp.dot(e, A)
-                                    at_ = (-mu * rn * share / safe) * (A - eA * e)
-                                    arn = -share * (wp.dot(n, A) + mu * eA) - wp.dot(at_, n)
-                                    an = -rn * (share * A + at_) + arn * r
-                                    ar = at_ + arn * n
-                                    ad = (an - wp.dot(n, an) * n) / length
-                                    a_gradient[a * size + node] = a_gradient[a * size + node] + w[0] * ad
-                                    a_gradient[b * size + node] = a_gradient[b * size + node] + w[1] * ad
-                                    wp.atomic_add(a_friction, s, pair, -rn * share * eA)
+                                    at_ = (-mu * push / safe) * (A - eA * e)
+                                    a_push -= mu * eA
+                                    wp.atomic_add(a_friction, s, pair, -push * eA)
+                                ar = at_ - wp.dot(at_, n) * n
+                                an = an - wp.dot(at_, n) * r - rn * at_
+                                spring = wp.static(real(PUSH)) / dt[s]
+                                if spring * w[2] + wp.static(real(DAMPING)) * rn < rn + wp.static(real(PARTING)) * dx[s] / dt[s]:
+                                    ca = a_reach.shape[1] / 2 + b - first[s]
+                                    cb = a_reach.shape[1] / 2 + a - first[s]
+                                    if w[1] == real(0.0):
+                                        ca = a - first[s]
+                                        cb = ca
+                                    elif w[0] == real(0.0):
+                                        ca = b - first[s]
+                                        cb = ca
+                                    a_reach[a * size + node, ca] = a_reach[a * size + node, ca] + spring * a_push
+                                    a_reach[b * size + node, cb] = a_reach[b * size + node, cb] + spring * a_push
+                                    ar = ar + wp.static(real(DAMPING)) * a_push * n
+                                    an = an + wp.static(real(DAMPING)) * a_push * r
+                                else:
+                                    ar = ar + a_push * n
+                                    an = an + a_push * r
+                                ad = (an - wp.dot(n, an) * n) / length
+                                a_gradient[a * size + node] = a_gradient[a * size + node] + w[0] * ad
+                                a_gradient[b * size + node] = a_gradient[b * size + node] + w[1] * ad
                                 ba = ar / qa[3]
                                 bb = -ar / qb[3]
                                 ma = -wp.dot(ba, va) + a_share * qb[3] / total
@@ -360,7 +351,7 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
         find_shared=find_shared,
         add_gradients=add_gradients,
         add_gradients_adjoint=add_gradients_adjoint,
-        find_reach=find_reach,
+        **vars(reach_kernels.build(real, name, own)),
         exchange=exchange,
         exchange_adjoint=exchange_adjoint,
     )

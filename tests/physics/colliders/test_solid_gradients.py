@@ -91,7 +91,7 @@ class Problem:
         poses = torch.cat([c.poses for c in frames.colliders if c.force is not None])
         twists = torch.cat([c.velocity for c in frames.colliders if c.force is not None])
         total = 0.0
-        for i, t in enumerate((*frames, 1e-2 * frames.forces, 0.1 * frames.torques, poses, twists)):
+        for i, t in enumerate((*frames, 1e-4 * frames.forces, 1e-3 * frames.torques, poses, twists)):
             weights = torch.randn(t.shape, generator=torch.Generator().manual_seed(i), dtype=t.dtype)
             total = total + (t * weights.to(t.device)).sum()
         return total
