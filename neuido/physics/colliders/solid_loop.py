@@ -1,6 +1,7 @@
 """The launches for the solids in one substep of a rollout, and their adjoints."""
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import torch
@@ -11,7 +12,6 @@ from neuido.physics.colliders.contact import CONTACTS, SEPARATE
 from neuido.physics.colliders.solid_contact import STATE, TWIST
 from neuido.physics.colliders.solid_tables import SolidInputs, SolidTable
 from neuido.physics.colliders.tables import ColliderTable
-from neuido.physics.multibody import press_kernels
 from neuido.physics.runtime.device import launch, launch_adjoint, real_of
 
 assert CONTACTS["sticky"] == 1  # as `rigid_motion.push` has it
@@ -56,11 +56,12 @@ class SolidLoop:
         pull: Gravity [m/s^2], (T, S, 3) or (1, S, 3).
         friction: Friction of the planes [-], (S, K).
         tape: Record of the rollout; written, and read by the adjoints.
+        presses: The kernels of `multibody.press_kernels`.
     """
 
     def __init__(
         self, table: SolidTable, planes: ColliderTable, origin: Tensor, dx: Tensor, dt: Tensor,
-        inputs: Sequence[Tensor], pull: Tensor, friction: Tensor, tape: SolidTape,
+        inputs: Sequence[Tensor], pull: Tensor, friction: Tensor, tape: SolidTape, presses: SimpleNamespace,
     ) -> None:  # fmt: skip
         self.table, self.planes, self.tape = table, planes, tape
         self.origin, self.dx, self.dt, self.pull, self.plane_friction = origin, dx, dt, pull, friction
@@ -68,7 +69,7 @@ class SolidLoop:
         real = real_of(dx.dtype)
         self.contact, self.motion = solid_contact.build(real), rigid_motion.build(real)
         self.device, self.count = dx.device, table.kind.numel()
-        self.presses = press_kernels.build(real) if bool((table.kind == SEPARATE).any()) else None
+        self.presses = presses if bool((table.kind == SEPARATE).any()) else None
         self.pressed, self.a_pressed = (dx.new_empty(0, table.kind.shape[1], 3) for _ in range(2))
         self.touching = self.count * table.points.shape[2] * planes.kind.shape[1]
 

@@ -27,13 +27,13 @@ from neuido.physics.mpm.plan import (
 )
 from neuido.physics.mpm.rollout import (
     Tape,
+    add_to_grid,
     flow_inputs,
     grid_inputs,
     meet,
     stress,
     stress_inputs,
     swell,
-    to_grid,
     update_nodes,
 )
 from neuido.physics.runtime.device import real_of, torch_stream
@@ -206,6 +206,12 @@ def recompute(
         if solids is not None:
             solids.meet(n, setup.room.index, met, velocity, impulse=solids.spare)
     return tau, grid, met, velocity
+
+
+def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
+    """Zero `grid`, write momentum and mass of the nodes into it, and return it."""
+    add_to_grid(plan, x, v, C, tau, mass, grid.zero_())
+    return grid
 
 
 def update_history_adjoint(

@@ -14,7 +14,9 @@ from neuido.physics.effects import stress_kernels
 from neuido.physics.effects.coefficients import Layout, Tables
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine, Law
+from neuido.physics.mpm.kernels import stencil
 from neuido.physics.mpm.state import Setup
+from neuido.physics.multibody import press_kernels
 from neuido.physics.runtime.device import launch, real_of
 from neuido.physics.runtime.events import MarkRecorder
 
@@ -165,8 +167,9 @@ def solid_loop(plan: Plan, inputs: Sequence[Tensor], tape: SolidTape | None) -> 
     setup = plan.setup
     if tape is None or setup.solids is None:
         return None
+    presses = press_kernels.build(real_of(setup.dtype), stencil.functions)
     own = inputs[SOLIDS:ATTACHED], inputs[STATES + 1], inputs[STATES + 3]
-    return SolidLoop(setup.solids, setup.colliders, setup.origin, setup.dx, setup.dt, *own, tape)
+    return SolidLoop(setup.solids, setup.colliders, setup.origin, setup.dx, setup.dt, *own, tape, presses)
 
 
 def attachment_loop(plan: Plan, inputs: Sequence[Tensor], solids: SolidLoop | None) -> AttachmentLoop | None:

@@ -356,12 +356,6 @@ def node_range(plan: Plan, x: Tensor | None) -> slice:
     return slice(max(first - 1, 0) * plane, min(last + 4, planes) * plane)
 
 
-def to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> Tensor:
-    """Zero `grid`, write momentum and mass of the nodes into it, and return it."""
-    add_to_grid(plan, x, v, C, tau, mass, grid.zero_())
-    return grid
-
-
 def add_to_grid(plan: Plan, x: Tensor, v: Tensor, C: Tensor, tau: Tensor, mass: Tensor, grid: Tensor) -> None:
     """Add momentum and mass of the particles to the nodes of `grid`."""
     setup = plan.setup

@@ -8,6 +8,7 @@ soon as it lies within a cell of the solid begins half a cell early: a ball of t
 """
 
 import functools
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import warp as wp
@@ -15,15 +16,19 @@ import warp as wp
 from neuido.physics.colliders import signed_distance
 from neuido.physics.colliders.contact import SEPARATE
 from neuido.physics.colliders.solid_contact import STATE
-from neuido.physics.mpm.kernels import stencil
 from neuido.physics.multibody.contact_kernels import PUSH
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(real: type) -> SimpleNamespace:
-    """Return the kernels `press` and `press_adjoint` for one scalar type."""
+def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespace:
+    """Return the kernels `press` and `press_adjoint` for one scalar type.
+
+    Args:
+        real: `wp.float32` or `wp.float64`.
+        stencil: Returns the functions of the transfers' weights (`mpm.stencil.functions`).
+    """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -34,7 +39,7 @@ def build(real: type) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     shapes = signed_distance.functions(real, name)
     distance, distance_adjoint = shapes.distance, shapes.distance_adjoint
-    own = stencil.functions(real, name, native=False)
+    own = stencil(real, name, native=False)
     spline, spline_slope, first_node = own.spline, own.spline_slope, own.first_node
     stencil_offset, flat_index = own.stencil_offset, own.flat_index
 
