@@ -274,6 +274,7 @@ class Solid:
         path: The motion in time; it replaces position and velocity.
         mass: Mass of a free rigid body [kg]; None: not free.
         inertia: Inertia of a free body about its centre of mass in its own axes [kg m^2], (3, 3); None: that of a uniform density.
+        restitution: Share of the normal velocity with which a free body leaves a plane or another solid [-]; the larger one of two counts.
         name: Name in results.
     """
 
@@ -286,6 +287,7 @@ class Solid:
     path: Keyframes | None = None
     mass: float | None = None
     inertia: tuple[Vector, Vector, Vector] | None = None
+    restitution: float = 0.0
     name: str = ""
 
 

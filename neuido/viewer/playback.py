@@ -135,8 +135,7 @@ class Playback:
             for drawn in self.drawn:
                 for cloud in (drawn.cloud, drawn.measured):
                     cloud.scale = scale
-                    if cloud.handle is not None:
-                        cloud.handle.point_size = cloud.size(0.55 if drawn.motion.reference is not None else 1.0)
+                    cloud.resize(0.55 if drawn.motion.reference is not None else 1.0)
 
     def _choose(self, name: str, on: bool) -> None:
         for drawn in self.drawn:
@@ -153,6 +152,7 @@ class Playback:
             if not self.play.value or length <= 0:
                 if told and self.slider.value != self.frame:  # just stopped
                     self.show(self.frame)
+                self._prepare()
                 continue
             if int(np.searchsorted(times, now, side="right")) - 1 != self.frame:  # someone moved the slider
                 now = float(times[self.frame])
@@ -162,6 +162,14 @@ class Playback:
                 due = time.monotonic() - told > TOLD_SECONDS
                 told = time.monotonic() if due else told
                 self.show(frame, told=due)
+
+    def _prepare(self) -> None:
+        """Send a frame that is not shown yet, so that playing does not wait for it."""
+        with self._lock:
+            for drawn in self.drawn:
+                if drawn.prepare(self._colour):
+                    self.server.flush()
+                    return
 
     def wait(self) -> None:
         """Serve until `stop` is called or the process is interrupted."""

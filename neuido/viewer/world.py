@@ -19,6 +19,10 @@ PORTS = (1, 65535)
 DOT = 0.55
 """`point_size` relative to the distance of neighbours. viser draws a point about 2.7 times as wide (measured in a picture), so that points
 of a lattice overlap by a little more than its diagonal, and a body is closed."""
+KEPT_BYTES = 200e6
+"""Largest memory of the points that a page keeps [bytes]; a laptop's graphics card shares its memory with the machine."""
+POINT_BYTES = 15
+"""Memory of a point in the page: three numbers of float32 and a colour [bytes]."""
 FLOOR_REACH = 3.0
 """Side of a drawn floor relative to the size of what is shown."""
 
@@ -159,22 +163,74 @@ def _quaternion(rotation: np.ndarray) -> tuple[float, float, float, float]:
 
 
 class Cloud:
-    """Points of one motion, or of a state that is simulated, with measured points and arrows where there are any."""
+    """Points of one motion, or of a state that is simulated, with measured points and arrows where there are any.
 
-    def __init__(self, server: Any, name: str, spacing: float) -> None:
+    The points of a recorded frame stay in the page, hidden, so that showing the frame again costs no more than making it visible: a browser
+    takes longer to take in new points than to draw them.
+
+    Args:
+        server: Server of the page.
+        name: Name in the tree of the scene.
+        spacing: Distance of neighbours [m].
+        frames: Number of frames that the page may keep; 0: none.
+        points: Number of points of a frame.
+    """
+
+    def __init__(self, server: Any, name: str, spacing: float, frames: int = 0, points: int = 0) -> None:
         self.server, self.name, self.spacing, self.scale, self.visible = server, name, spacing, 1.0, True
         self.handle: Any = None
+        self.keeps = 1 < frames <= KEPT_BYTES / (POINT_BYTES * max(points, 1))
+        self.kept: dict[int, Any] = {}
 
-    def show(self, points: np.ndarray, colours: np.ndarray, factor: float = 1.0) -> None:
-        """Draw points (N, 3) [m] with colours (N, 3) uint8, in place of those before."""
+    def show(self, points: np.ndarray, colours: np.ndarray, factor: float = 1.0, frame: int = 0, hidden: bool = False) -> None:
+        """Draw points (N, 3) [m] with colours (N, 3) uint8, in place of those before.
+
+        Args:
+            points: Places [m].
+            colours: Colours.
+            factor: Size of a point relative to the usual one.
+            frame: The frame that they belong to.
+            hidden: Send them to the page without drawing them yet, where it keeps frames.
+        """
         points = points.astype(np.float32)
-        if self.handle is not None and self.handle.points.shape == points.shape:
+        if not self.keeps and self.handle is not None and self.handle.points.shape == points.shape:
             self.handle.points, self.handle.colors = points, colours
-        else:
-            self.handle = self.server.scene.add_point_cloud(
-                f"/{self.name}", points, colours, point_size=self.size(factor), point_shape="circle", precision="float32",
-                point_shading="gradient", visible=self.visible,
-            )  # fmt: skip
+            self.handle.visible = self.visible
+            return
+        name = f"/{self.name}/{frame}" if self.keeps else f"/{self.name}"
+        added = self.server.scene.add_point_cloud(
+            name, points, colours, point_size=self.size(factor), point_shape="circle", precision="float32", point_shading="gradient",
+            visible=self.visible and not hidden,
+        )  # fmt: skip
+        if self.keeps:
+            self.kept[frame] = added
+        if not hidden:
+            self._replace(added)
+
+    def recall(self, frame: int) -> bool:
+        """Draw a frame that the page has kept; return whether it has."""
+        if frame in self.kept:
+            self._replace(self.kept[frame])
+        return frame in self.kept
+
+    def _replace(self, handle: Any) -> None:
+        if self.keeps and self.handle is not None and self.handle is not handle:
+            self.handle.visible = False
+        self.handle = handle
+        handle.visible = self.visible
+
+    def forget(self) -> None:
+        """Remove what the page has kept."""
+        for handle in self.kept.values():
+            handle.remove()
+        if self.kept:
+            self.handle = None
+        self.kept = {}
+
+    def resize(self, factor: float = 1.0) -> None:
+        """Draw the points in the size of `scale`."""
+        for handle in self.kept.values() or ([] if self.handle is None else [self.handle]):
+            handle.point_size = self.size(factor)
 
     def size(self, factor: float = 1.0) -> float:
         """Return the `point_size` of a point [m]."""
@@ -187,8 +243,10 @@ class Drawn:
     def __init__(self, server: Any, content: Content, index: int) -> None:
         self.server, self.content, self.motion, self.index = server, content, content.motions[index], index
         spacing = self.motion.spacing * self.motion.thinning ** (1 / 3) or 0.02 * content.size
-        self.cloud = Cloud(server, f"motion/{index}/particles", spacing)
+        room = content.frames, sum(motion.x.shape[1] for motion in content.motions)
+        self.cloud = Cloud(server, f"motion/{index}/particles", spacing, *room)
         self.measured = Cloud(server, f"motion/{index}/measured", 0.6 * spacing)
+        self.quantity = ""
         self.arrows: Any = None
         self.shown = {"arrows": True, "measured": True, "particles": True, "skin": bool(self.motion.skins)}
         self.label: Any = None
@@ -197,18 +255,40 @@ class Drawn:
     def show(self, frame: int, quantity: str) -> None:
         """Draw a frame with the colours of a quantity."""
         motion = self.motion
-        colours, seen = motion.colours(frame, quantity), np.isfinite(motion.x[frame]).all(axis=1)
-        seen[np.arange(len(seen)) % motion.thinning > 0] = False
+        self._choose(quantity)
         self.cloud.visible = self.shown["particles"] and not (self.shown["skin"] and motion.skins)
-        lit = motion.lit(motion.x[frame], colours)
-        self.cloud.show(motion.x[frame][seen] + motion.shift, lit[seen], 0.55 if motion.reference is not None else 1.0)
-        self.cloud.handle.visible = self.cloud.visible
+        if not self.cloud.recall(frame):
+            self._send(frame, hidden=False)
         if motion.reference is not None:
-            self._show_residual(frame, seen)
+            self._show_residual(frame, self._seen(frame))
         for i, skin in enumerate(motion.skins):
-            self._show_skin(i, skin, frame, colours)
+            self._show_skin(i, skin, frame, motion.colours(frame, quantity))
         if len(self.content.motions) > 1:
-            self._show_name(frame, seen)
+            self._show_name(frame, self._seen(frame))
+
+    def prepare(self, quantity: str) -> bool:
+        """Send the first frame that the page lacks, hidden; return whether there was one."""
+        self._choose(quantity)
+        if not self.cloud.keeps or len(self.cloud.kept) == self.content.frames:
+            return False
+        self._send(next(k for k in range(self.content.frames) if k not in self.cloud.kept), hidden=True)
+        return True
+
+    def _choose(self, quantity: str) -> None:
+        if quantity != self.quantity:
+            self.cloud.forget()
+        self.quantity = quantity
+
+    def _seen(self, frame: int) -> np.ndarray:
+        seen = np.isfinite(self.motion.x[frame]).all(axis=1)
+        seen[np.arange(len(seen)) % self.motion.thinning > 0] = False
+        return seen
+
+    def _send(self, frame: int, hidden: bool) -> None:
+        motion, seen = self.motion, self._seen(frame)
+        lit = motion.lit(motion.x[frame], motion.colours(frame, self.quantity))
+        factor = 0.55 if motion.reference is not None else 1.0
+        self.cloud.show(motion.x[frame][seen] + motion.shift, lit[seen], factor, frame, hidden)
 
     def _show_residual(self, frame: int, seen: np.ndarray) -> None:
         motion = self.motion

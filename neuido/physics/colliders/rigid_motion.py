@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from neuido.physics.colliders import signed_distance
 from neuido.physics.colliders.solid_contact import BODY, STATE, TWIST
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -19,7 +20,10 @@ RECOVERY = 0.25
 
 @cached
 def build(real: type) -> SimpleNamespace:
-    """Return the kernels `push` (contact of free bodies with planes) and `advance`; `real` is the type of gravity and planes."""
+    """Return the kernels `push` and `collide` (contact of free bodies with planes and with solids) and `advance`.
+
+    `real` is the type of gravity and planes.
+    """
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
@@ -30,6 +34,7 @@ def build(real: type) -> SimpleNamespace:
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=True)
     f64 = wp.float64
+    distance = signed_distance.functions(wp.float64, name).distance
 
     @func
     def turn_of(st: state_vec):
@@ -64,6 +69,7 @@ def build(real: type) -> SimpleNamespace:
         body: wp.array2d(dtype=body_vec),
         points: wp.array3d(dtype=wp.vec4d),
         sharing: wp.array2d(dtype=wp.int32),
+        damping: wp.array2d(dtype=wp.float64),
         plane: wp.array2d(dtype=vec4),
         kind: wp.array2d(dtype=wp.int32),
         friction: wp.array2d(dtype=real),
@@ -71,7 +77,8 @@ def build(real: type) -> SimpleNamespace:
     ):
         """Add the impulses of the planes on the touch points of free bodies to `pushed[step]`; the thread counts scene, body, point, plane.
 
-        The contact is a critically damped spring on the effective mass at the point, and never pulls. Friction is Coulomb's.
+        The contact is a damped spring on the effective mass at the point, critically for no restitution, and never pulls. Friction is
+        Coulomb's.
         """
         count = points.shape[2] * plane.shape[1]
         i = wp.tid()
@@ -97,7 +104,7 @@ def build(real: type) -> SimpleNamespace:
                 mobility = f64(1.0) / b[0] + wp.dot(lever, turned(q, lever, wp.inverse(inertia_of(b))))
                 mass = f64(1.0) / (mobility * f64(sharing[s, c]))
                 rate = f64(wp.static(RECOVERY))
-                jn = mass * (-rate * rate * gap / h - f64(2.0) * rate * vn)
+                jn = mass * (-rate * rate * gap / h - f64(2.0) * rate * damping[s, c] * vn)
                 if jn > f64(0.0):
                     t = v - vn * n
                     speed = wp.length(t)
@@ -107,6 +114,83 @@ def build(real: type) -> SimpleNamespace:
                     J = jn * n - grip * t
                     L = wp.cross(arm, J)
                     wp.atomic_add(pushed, step, s, c, twist_vec(J[0], J[1], J[2], L[0], L[1], L[2]))
+
+    @kernel
+    def collide(
+        step: int,
+        dt: wp.array(dtype=real),
+        state: wp.array3d(dtype=state_vec),
+        twist: wp.array3d(dtype=twist_vec),
+        body: wp.array2d(dtype=body_vec),
+        points: wp.array3d(dtype=wp.vec4d),
+        sharing: wp.array2d(dtype=wp.int32),
+        damping: wp.array2d(dtype=wp.float64),
+        friction: wp.array2d(dtype=wp.float64),
+        shape: wp.array2d(dtype=wp.int32),
+        size: wp.array2d(dtype=wp.vec4d),
+        info: wp.array2d(dtype=wp.vec4i),
+        samples: wp.array(dtype=wp.vec4d),
+        pushed: wp.array3d(dtype=twist_vec),
+    ):
+        """Add the impulses of the touch points of free bodies on other solids to `pushed[step]`, equal and opposite at one place.
+
+        The thread counts scene, body, point, solid. The spring is that of `push` on the effective mass of both; of two free bodies, whose
+        points may touch both ways, each way has half of it. The pair has the larger friction and the larger restitution of the two.
+        """
+        solids = points.shape[1]
+        count = points.shape[2] * solids
+        i = wp.tid()
+        s = i / (solids * count)
+        c = (i / count) % solids
+        p = (i / solids) % points.shape[2]
+        d = i % solids
+        b = body[s, c]
+        at = points[s, c, p]
+        if b[0] > f64(0.0) and at[3] >= f64(0.0) and shape[s, d] > 0 and d != c:
+            st = state[step, s, c]
+            other = state[step, s, d]
+            q = turn_of(st)
+            turn = turn_of(other)
+            centre = wp.vec3d(st[0], st[1], st[2])
+            place = wp.vec3d(other[0], other[1], other[2])
+            point = wp.quat_rotate(q, wp.vec3d(at[0], at[1], at[2]))
+            found = distance(shape[s, d], size[s, d], samples, info[s, d], wp.quat_rotate_inv(turn, centre + point - place))
+            gap = found[3] - at[3]
+            if gap < f64(0.0):
+                n = wp.quat_rotate(turn, wp.vec3d(found[0], found[1], found[2]))
+                arm = point - at[3] * n
+                reach = centre + arm - place
+                h = f64(dt[s])
+                v = wp.vec3d(st[7], st[8], st[9]) + wp.cross(wp.vec3d(st[10], st[11], st[12]), arm)
+                lever = wp.cross(arm, n)
+                mobility = f64(1.0) / b[0] + wp.dot(lever, turned(q, lever, wp.inverse(inertia_of(b))))
+                half = f64(1.0)
+                e = body[s, d]
+                if e[0] > f64(0.0):
+                    v = v - wp.vec3d(other[7], other[8], other[9]) - wp.cross(wp.vec3d(other[10], other[11], other[12]), reach)
+                    lift = wp.cross(reach, n)
+                    mobility = mobility + f64(1.0) / e[0] + wp.dot(lift, turned(turn, lift, wp.inverse(inertia_of(e))))
+                    half = f64(0.5)
+                else:
+                    t = twist[wp.min(step, twist.shape[0] - 1), s, d]
+                    v = v - wp.vec3d(t[0], t[1], t[2]) - wp.cross(wp.vec3d(t[3], t[4], t[5]), reach)
+                vn = wp.dot(v, n)
+                mass = half / (mobility * f64(sharing[s, c]))
+                rate = f64(wp.static(RECOVERY))
+                ratio = wp.min(damping[s, c], damping[s, d])
+                jn = mass * (-rate * rate * gap / h - f64(2.0) * rate * ratio * vn)
+                if jn > f64(0.0):
+                    along = v - vn * n
+                    speed = wp.length(along)
+                    mu = wp.max(friction[s, c], friction[s, d])
+                    grip = mass
+                    if speed * mass > mu * jn:
+                        grip = mu * jn / speed
+                    J = jn * n - grip * along
+                    L = wp.cross(arm, J)
+                    K = -wp.cross(reach, J)
+                    wp.atomic_add(pushed, step, s, c, twist_vec(J[0], J[1], J[2], L[0], L[1], L[2]))
+                    wp.atomic_add(pushed, step, s, d, twist_vec(-J[0], -J[1], -J[2], K[0], K[1], K[2]))
 
     @kernel
     def advance(
@@ -150,4 +234,4 @@ def build(real: type) -> SimpleNamespace:
             turn = wp.normalize(rotation_by(f64(0.5) * h * wp.vec3d(t[3], t[4], t[5])) * q)
             state_next[step + 1, s, c] = state_vec(y[0], y[1], y[2], turn[3], turn[0], turn[1], turn[2], t[0], t[1], t[2], t[3], t[4], t[5])
 
-    return SimpleNamespace(push=push, advance=advance)
+    return SimpleNamespace(push=push, collide=collide, advance=advance)

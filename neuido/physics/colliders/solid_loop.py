@@ -71,6 +71,8 @@ class SolidLoop:
         self.device, self.count = dx.device, table.kind.numel()
         self.presses = presses if bool((table.kind == SEPARATE).any()) else None
         self.pressed, self.a_pressed = (dx.new_empty(0, table.kind.shape[1], 3) for _ in range(2))
+        self.colliding = self.count * table.points.shape[2] * table.kind.shape[1] * (table.kind.shape[1] > 1)
+        self.exact = table.size.double(), table.info, table.samples.double()
         self.touching = self.count * table.points.shape[2] * planes.kind.shape[1]
 
     def begin(self) -> None:
@@ -130,7 +132,12 @@ class SolidLoop:
 
     def _push_inputs(self, n: int) -> list:
         t = self.table
-        return [n, self.dt, self.tape.state, self.body, t.points, t.sharing, self.planes.plane, self.planes.kind, self.plane_friction,
+        return [n, self.dt, self.tape.state, self.body, t.points, t.sharing, t.damping, self.planes.plane, self.planes.kind,
+                self.plane_friction, self.tape.pushed]  # fmt: skip
+
+    def _collide_inputs(self, n: int) -> list:
+        t = self.table
+        return [n, self.dt, self.tape.state, self.twist, self.body, t.points, t.sharing, t.damping, self.friction, t.shape, *self.exact,
                 self.tape.pushed]  # fmt: skip
 
     def _advance_inputs(self, n: int) -> list:
@@ -141,6 +148,8 @@ class SolidLoop:
         """Move the solids by substep n, after the contact."""
         if self.table.free:
             launch(self.motion.push, self.touching, self._push_inputs(n), self.device)
+            if self.colliding:
+                launch(self.motion.collide, self.colliding, self._collide_inputs(n), self.device)
         launch(self.motion.advance, self.count, self._advance_inputs(n), self.device)
 
     def start_adjoint(
@@ -170,7 +179,11 @@ class SolidLoop:
         adjoints = [None, None, self.a_pull, self.a_twist, self.a_body, self.a_impulse, self.a_pushed, self.a_state, self.a_state]
         launch_adjoint(self.motion.advance, self.count, self._advance_inputs(n), adjoints, self.device)
         if self.table.free:
-            adjoints = [None, None, self.a_state, self.a_body, None, None, None, None, self.a_plane_friction, self.a_pushed]
+            if self.colliding:
+                adjoints = [None, None, self.a_state, self.a_twist, self.a_body, None, None, None, self.a_own_friction]
+                adjoints += [None, None, None, None, self.a_pushed]
+                launch_adjoint(self.motion.collide, self.colliding, self._collide_inputs(n), adjoints, self.device)
+            adjoints = [None, None, self.a_state, self.a_body, None, None, None, None, None, self.a_plane_friction, self.a_pushed]
             launch_adjoint(self.motion.push, self.touching, self._push_inputs(n), adjoints, self.device)
 
     def meet_adjoint(self, n: int, index: Tensor, grid: Tensor, free: Tensor, a_velocity: Tensor) -> None:

@@ -1,6 +1,7 @@
 """Tables of the solid colliders of scenes, as the kernels read them, and their motion as differentiable inputs of a rollout."""
 
 import bisect
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -70,6 +71,8 @@ class SolidTable(NamedTuple):
     """Points at which free bodies touch planes, with radius, (S, C, N, 4) float64; unused ones have radius -1."""
     sharing: Tensor
     """How many points share the weight of a free body at most, (S, C) int32."""
+    damping: Tensor
+    """Damping ratio of the contact of free bodies with planes and solids [-], (S, C) float64; 1: critical, without restitution."""
     free: bool
     """Whether there is a free body."""
 
@@ -113,9 +116,11 @@ def solid_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.devic
     shape, kind, sharing = (torch.zeros(len(rows), count, dtype=torch.int32) for _ in range(3))
     size, reach = torch.zeros(len(rows), count, 4, dtype=torch.float64), torch.zeros(len(rows), count, dtype=torch.float64)
     info = torch.zeros(len(rows), count, 4, dtype=torch.int32)
+    damping = torch.ones(len(rows), count, dtype=torch.float64)
     samples, points = [], {}
     for s, (scene, row) in enumerate(zip(scenes, rows)):
         for c, solid in enumerate(row):
+            damping[s, c] = damping_ratio(solid.restitution)
             shape[s, c], kind[s, c] = SHAPES[type(solid)], CONTACTS[solid.contact]
             lengths, bound, dims, own = _geometry(solid, scene.dx)
             size[s, c], reach[s, c] = torch.tensor(lengths), bound
@@ -131,7 +136,15 @@ def solid_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.devic
     flat = torch.from_numpy(np.concatenate(samples)) if samples else torch.zeros(1, 4, dtype=torch.float64)
     real = [t.to(device, dtype) for t in (size, reach, flat)]
     return SolidTable(shape.to(device), kind.to(device), real[0], real[1], info.to(device), real[2], touch.to(device),
-                      sharing.to(device), bool(points))  # fmt: skip
+                      sharing.to(device), damping.to(device), bool(points))  # fmt: skip
+
+
+def damping_ratio(restitution: float) -> float:
+    """Return the ratio of the damping of a spring to the critical one with which bodies part at this share of their speed."""
+    if restitution <= 0.0:
+        return 1.0
+    loss = -math.log(restitution)
+    return loss / math.hypot(math.pi, loss)
 
 
 def _geometry(solid: Solid, dx: float) -> tuple[tuple[float, ...], float, tuple[int, int, int], np.ndarray | None]:

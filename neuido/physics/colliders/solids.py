@@ -164,6 +164,8 @@ def _check(solid: Solid, **lengths: float) -> None:
         raise UserError(f"contact of a {kind} is {solid.contact!r}; choose one of sticky, slip, separate")
     if not solid.friction >= 0.0:
         raise UserError(f"friction of a {kind} is {solid.friction}; give zero or more")
+    if not 0.0 <= solid.restitution <= 1.0:
+        raise UserError(f"restitution of a {kind} is {solid.restitution}; give a share from 0 to 1")
     size = math.hypot(*solid.rotation)
     if len(solid.rotation) != 4 or not (size > 0 and math.isfinite(size)):
         raise UserError(f"rotation of a {kind} is {list(solid.rotation)}; give a quaternion (w, x, y, z) that is not zero")

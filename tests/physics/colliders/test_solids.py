@@ -123,6 +123,48 @@ def test_a_free_box_comes_to_rest_on_a_plane_and_one_in_the_air_falls_freely_and
     assert float(rest.poses[-1, 1, 1]) > 0.999
 
 
+AWAY = block((0.85, 0.85, 0.05), (0.95, 0.95, 0.15), (2, 2, 2))
+"""A body that touches no solid."""
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_free_spheres_collide_head_on_by_the_closed_form(restitution):
+    """v' = (p ± e m' v_rel) / M; an explicit spring meets e to 2 %. Momentum, and an off-centre pair's angular momentum, are exact."""
+    for offset in (0.0, 0.03):
+        balls = (Sphere(0.1, position=(0.3, 0.5, 0.5), velocity=(1.0, 0.0, 0.0), mass=2.0, friction=0.3, restitution=restitution),
+                 Sphere(0.08, position=(0.6, 0.5 + offset, 0.5), velocity=(-0.5, 0.0, 0.0), mass=1.0))  # fmt: skip
+        _, frames = run(Scene(cells=10, dt=1e-4, walls=None, gravity=(0.0,) * 3, colliders=balls), AWAY, 2000, 1000)
+        p, L = [], []
+        for k in (0, -1):
+            parts = [
+                (ball.mass, 0.4 * ball.mass * ball.radius**2, f.poses[k, :3, 3], f.velocity[k]) for ball, f in zip(balls, frames.colliders)
+            ]
+            p.append(sum(m * u[:3] for m, _, _, u in parts))
+            L.append(sum(torch.linalg.cross(x, m * u[:3]) + i * u[3:] for m, i, x, u in parts))
+        assert float((p[1] - p[0]).norm()) < 1e-13 and float((L[1] - L[0]).norm()) < 1e-13
+        speeds = [float(f.velocity[-1, 0]) for f in frames.colliders]
+        if offset == 0.0:
+            assert speeds[0] == pytest.approx((1.5 - restitution * 1.0 * 1.5) / 3, abs=0.03)
+            assert speeds[1] == pytest.approx((1.5 + restitution * 2.0 * 1.5) / 3, abs=0.06)
+        else:
+            assert abs(float(frames.colliders[1].velocity[-1, 5])) > 0.1  # friction turned it
+
+
+def test_two_boxes_rest_in_a_stack_on_a_third():
+    """One free box lies on a box at rest, and another one on it; they stay where the closed form has them."""
+    table = Cuboid((0.5, 0.2, 0.5), position=(0.4, 0.2, 0.5), friction=0.5)
+    low = Cuboid((0.2, 0.1, 0.2), position=(0.4, 0.355, 0.5), mass=2.0)
+    top = Cuboid((0.15, 0.1, 0.15), position=(0.42, 0.465, 0.5), rotation=(0.98, 0.0, 0.2, 0.0), mass=1.0)
+    body = block((0.75, 0.11, 0.05), (0.95, 0.21, 0.15), (2, 2, 2))
+    floor = Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0))
+    _, frames = run(Scene(cells=10, dt=1e-3, walls=None, gravity=(0.0, -G, 0.0), colliders=(floor, table, low, top)), body, 500, 250)
+    for found, height, x in zip(frames.colliders[2:], (0.35, 0.45), (0.4, 0.42)):
+        assert float(found.velocity[-1].norm()) < 1e-3
+        assert float(found.poses[-1, 1, 3]) == pytest.approx(height, abs=1e-3)
+        assert float(found.poses[-1, 0, 3]) == pytest.approx(x, abs=2e-3)
+        assert float(found.poses[-1, 1, 1]) > 0.9999
+
+
 def test_a_moving_plate_carries_a_body_at_its_own_speed():
     plate = Cuboid((0.6, 0.2, 0.6), position=(0.35, 0.2, 0.5), friction=1.0, velocity=(0.4, 0.0, 0.0))
     body = block((0.25, 0.34, 0.4), (0.45, 0.46, 0.6), (4, 3, 4))
@@ -171,6 +213,7 @@ def test_planes_alone_keep_their_frames_and_have_no_forces():
         (lambda: Sphere(-0.1), "radius of a Sphere is -0.1"),
         (lambda: Sphere(0.1, contact="glue"), "contact of a Sphere is 'glue'"),
         (lambda: Sphere(0.1, friction=-1.0), "friction of a Sphere is -1.0"),
+        (lambda: Sphere(0.1, restitution=2.0), "restitution of a Sphere is 2.0"),
         (lambda: Cuboid((0.1, 0.2, 0.3), rotation=(0.0, 0.0, 0.0, 0.0)), "rotation of a Cuboid"),
         (lambda: Cuboid((0.1, 0.2, 0.3), mass=1.0, path=Keyframes((0.0,), ((0.0, 0.0, 0.0),))), "has a path and a mass"),
         (lambda: HalfSpace(mass=1.0), "cannot move freely"),

@@ -61,8 +61,23 @@ def test_balls_collide_head_on_by_the_closed_form(ratio):
         energy = 0.5 * (sim.mass[:, None] * frames.v.square()).sum((1, 2))
         assert energy[-1] < energy[0]
     lost = [1 - e for e in restitution]  # balls of 3 and 5 cells
-    assert 0 < lost[1] < 0.7 * lost[0]
-    assert lost[1] < 0.25
+    assert 0 < lost[1] < 0.9 * lost[0]
+    assert lost[1] < 0.15
+
+
+@pytest.mark.slow
+def test_what_a_collision_loses_is_of_first_order_in_the_cell():
+    """Restitution of 1 is the limit: balls of 10 cells lose less than 0.6 of what those of 5 cells do."""
+    lost = []
+    for cells in (24, 48):
+        scene = balls(cells=cells)
+        sim, steps = simulator(scene, torch.float32), round(0.15 / scene.dt)
+        with torch.no_grad():
+            frames = sim.rollout(steps, every=steps)
+        left, right = (velocity(sim, frames, body)[:, 0] for body in (0, 1))
+        lost.append(1 - float(right[-1] - left[-1]) / float(left[0] - right[0]))
+    assert 0 < lost[1] < 0.6 * lost[0]
+    assert lost[1] < 0.08
 
 
 def block_on_slope(angle, friction):
@@ -108,7 +123,7 @@ def test_block_slides_on_a_slope_by_coulombs_law(friction):
 
 @pytest.mark.slow  # half a minute
 def test_balls_that_are_pressed_together_approach_hertz():
-    """The largest force of a slow collision: Hertz for elastic spheres; the error is of first order in the cell."""
+    """The largest force of a slow collision: Hertz for elastic spheres."""
     radius, speed, errors = 0.2, 0.25, []
     stiff, reduced, mass = YOUNG / (1 - POISSON**2) / 2, radius / 2, 0.5 * RHO * 4 / 3 * math.pi * radius**3
     depth = (15 * mass * (2 * speed) ** 2 / (16 * math.sqrt(reduced) * stiff)) ** 0.4
@@ -128,9 +143,7 @@ def test_balls_that_are_pressed_together_approach_hertz():
         force = -(v[1:] - v[:-1]) * own / scene.dt
         forces.append(float(torch.nn.functional.avg_pool1d(force[None, None], 9, 1, 4).max()))
         errors.append(abs(forces[-1] / hertz - 1))
-    assert errors[1] < 0.7 * errors[0]
-    extrapolated = forces[1] - (forces[0] - forces[1]) * 20 / (30 - 20)
-    assert extrapolated == pytest.approx(hertz, rel=0.1)
+    assert max(errors) < 0.1  # balls of 8 and 12 cells a radius
 
 
 def stack(friction=0.3, third=False, contact="separate", **options):
