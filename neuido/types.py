@@ -274,7 +274,8 @@ class Solid:
         path: The motion in time; it replaces position and velocity.
         mass: Mass of a free rigid body [kg]; None: not free.
         inertia: Inertia of a free body about its centre of mass in its own axes [kg m^2], (3, 3); None: that of a uniform density.
-        restitution: Share of the normal velocity with which a free body leaves a plane or another solid [-]; the larger one of two counts.
+        restitution: Share of the normal velocity with which a free body leaves a plane or another solid [-]; the larger one of two
+            counts. 0 leaves about a tenth, since contact never pulls.
         name: Name in results.
     """
 

@@ -226,14 +226,15 @@ def mass_properties(vertices: np.ndarray, faces: np.ndarray) -> tuple[float, np.
 
 
 def touch_points(solid: Solid) -> np.ndarray:
-    """Return the points, each with a radius, at which a free solid touches planes, in its own axes: x, y, z, r [m], (N, 4)."""
+    """Return the points, each with a radius, at which a free solid touches planes and solids, in its own axes: x, y, z, r [m], (N, 4)."""
     if isinstance(solid, Sphere):
         return np.array([[0.0, 0.0, 0.0, solid.radius]])
     if isinstance(solid, Capsule):
         return np.array([[0.0, side * solid.length / 2, 0.0, solid.radius] for side in (-1, 1)])
     if isinstance(solid, Cuboid):
-        corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * np.array(solid.size)
-        return np.pad(corners, ((0, 0), (0, 1)))
+        lattice = np.array(np.meshgrid(*[[-0.5, 0.0, 0.5]] * 3)).reshape(3, -1).T
+        lattice = lattice[np.abs(lattice).max(axis=1) > 0]  # corners, and the middles of edges and faces, which may meet another solid
+        return np.pad(lattice * np.array(solid.size), ((0, 0), (0, 1)))
     if isinstance(solid, Cylinder):
         angle = 2 * math.pi * np.arange(RIM_POINTS) / RIM_POINTS
         rim = np.stack([solid.radius * np.cos(angle), 0 * angle, solid.radius * np.sin(angle), 0 * angle], axis=1)
@@ -253,7 +254,7 @@ def sharing(solid: Solid) -> int:
     """Return how many of the touch points of a free solid share its weight on a plane at most."""
     if isinstance(solid, Sphere):
         return 1
-    return {Capsule: 2, Cuboid: 4, Cylinder: RIM_POINTS}.get(type(solid), 4)
+    return {Capsule: 2, Cuboid: 9, Cylinder: RIM_POINTS}.get(type(solid), 4)
 
 
 def centre_of(solid: Solid) -> np.ndarray:

@@ -34,8 +34,8 @@ def ball_of_triangles(count: int = 2000) -> tuple[np.ndarray, np.ndarray]:
 def stiffness(dx: float) -> tuple[float, float]:
     """Return the factor of F = K d^1.5, and the force at the largest approach d of 0.02 m, over Hertz's.
 
-    An eighth of the ball lies between three frictionless walls. K is that of the slope of F^(2/3) over d, as in indentation tests, from 0.006
-    to 0.02 m.
+    An eighth of the ball lies between three frictionless walls. K is that of the slope of F^(2/3) over d, as in indentation tests, from
+    0.006 to 0.02 m.
     """
     axis = (torch.arange(int(2 * RADIUS / dx) + 1) + 0.5) * dx / 2
     x = torch.cartesian_prod(axis, axis, axis)
