@@ -10,7 +10,7 @@ from neuido.errors import UserError, suggest
 from neuido.physics.colliders.solids import Capsule, Cuboid, Cylinder, HalfSpace, HeightField, MeshCollider, Sphere
 from neuido.types import Keyframes, Solid
 
-SHARED = ("kind", "name", "position", "rotation", "contact", "friction", "velocity", "spin", "path", "mass", "inertia")
+SHARED = ("kind", "name", "position", "rotation", "contact", "friction", "velocity", "spin", "path", "mass", "inertia", "restitution")
 OWN: dict[str, tuple[type[Solid], tuple[str, ...], tuple[str, ...]]] = {
     "half_space": (HalfSpace, (), ()),
     "sphere": (Sphere, ("radius",), ()),
