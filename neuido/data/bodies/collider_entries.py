@@ -68,6 +68,8 @@ def solid_from_dict(given: Mapping[str, Any], where: str, find: Callable[[str, s
             options[key] = vector(value, at)
         elif key in ("radius", "length", "mass"):
             options[key] = number(value, at, above=0.0)
+        elif key == "restitution":
+            options[key] = number(value, at, least=0.0)
         elif key == "friction":
             options[key] = number(value, at, least=0.0, infinite=True)
         elif key == "rotation":

@@ -135,7 +135,7 @@ def build(real: type) -> SimpleNamespace:
         """Add the impulses of the touch points of free bodies on other solids to `pushed[step]`, equal and opposite at one place.
 
         The thread counts scene, body, point, solid. The spring is that of `push` on the effective mass of both; of two free bodies, whose
-        points may touch both ways, each way has half of it. The pair has the larger friction and the larger restitution of the two.
+        points may touch both ways, each way has half of it. The pair has the mean friction and the larger restitution of the two.
         """
         solids = points.shape[1]
         count = points.shape[2] * solids
@@ -182,7 +182,7 @@ def build(real: type) -> SimpleNamespace:
                 if jn > f64(0.0):
                     along = v - vn * n
                     speed = wp.length(along)
-                    mu = wp.max(friction[s, c], friction[s, d])
+                    mu = f64(0.5) * (friction[s, c] + friction[s, d])
                     grip = mass
                     if speed * mass > mu * jn:
                         grip = mu * jn / speed

@@ -161,7 +161,7 @@ def test_two_boxes_rest_in_a_stack_on_a_third():
     top = Cuboid((0.15, 0.1, 0.15), position=(0.41, 0.465, 0.5), rotation=(0.998, 0.0, 0.06, 0.0), mass=1.0)
     body = block((0.75, 0.11, 0.05), (0.95, 0.21, 0.15), (2, 2, 2))
     floor = Plane((0.0, 0.1, 0.0), (0.0, 1.0, 0.0))
-    _, frames = run(Scene(cells=10, dt=1e-3, walls=None, gravity=(0.0, -G, 0.0), colliders=(floor, table, low, top)), body, 500, 250)
+    _, frames = run(Scene(cells=10, dt=5e-4, walls=None, gravity=(0.0, -G, 0.0), colliders=(floor, table, low, top)), body, 1000, 500)
     for found, height, x in zip(frames.colliders[2:], (0.35, 0.45), (0.4, 0.41)):
         assert float(found.velocity[-1].norm()) < 1e-3
         assert float(found.poses[-1, 1, 3]) == pytest.approx(height, abs=1e-3)
