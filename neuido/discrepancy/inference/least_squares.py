@@ -4,6 +4,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from neuido.discrepancy.problems.problem import Parameter, Point, Problem
 from neuido.discrepancy.store import Memo
@@ -210,7 +211,7 @@ def levenberg_marquardt(
             J = np.stack([(c - r) / s for c, s in zip(columns, steps, strict=True)], axis=1)
             fresh = True
         A, g = J.T @ J, J.T @ r
-        proposals = [np.clip(q + move, low, high) for move in _damped_steps(A, g, damping)]
+        proposals = [np.clip(q + move, low, high) for move in _damped_steps(A, g, damping, low - q, high - q)]
         proposals = _follow_edge(lambda at: margin(point_at(at)), q, A, g, damping, proposals, (low, high))
         predicted_gains = [-float((t - q) @ (2 * g + A @ (t - q))) for t in proposals]
         if max(predicted_gains) < nothing * cost and np.abs(proposals[0] - q).max() < 0.5:
@@ -264,9 +265,35 @@ def _with_prior_rows(slopes: np.ndarray, parameters: Sequence[Parameter]) -> np.
     return np.concatenate([slopes, rows]) if rows else slopes
 
 
-def _damped_steps(A: np.ndarray, g: np.ndarray, damping: float) -> list[np.ndarray]:
-    """Return the step for each damping from the normal matrix A (p, p) and the gradient g (p,), limited by `_limit_step`."""
-    return [_limit_step(-np.linalg.lstsq(H, g, rcond=None)[0]) for H in _damped_matrices(A, damping)]
+def _damped_steps(A: np.ndarray, g: np.ndarray, damping: float, low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+    """Return the step for each damping from the normal matrix A (p, p) and the gradient g (p,), limited by `_limit_step`.
+
+    A step that would leave the range from `low` to `high`, (p,) each, is replaced by the best one within it. To cut it off would leave the
+    other parameters where they make up for what is cut off, which is far away where several parameters act alike.
+    """
+    moves = []
+    for H in _damped_matrices(A, damping):
+        move = _limit_step(-np.linalg.lstsq(H, g, rcond=None)[0])
+        if ((move < low) | (move > high)).any():
+            move = _limit_step(_bounded(H, g, low, high))
+        moves.append(move)
+    return moves
+
+
+def _bounded(H: np.ndarray, g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the step x (p,) with the least x^T H x / 2 + g^T x between `low` and `high`."""
+    values, vectors = np.linalg.eigh(H)
+    root = np.sqrt(np.maximum(values, 1e-14 * max(values[-1], 1e-300)))
+    return bounded_least_squares(root[:, None] * vectors.T, -(vectors.T @ g) / root, low, high)
+
+
+def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the x (p,) between `low` and `high` for which A x is nearest to b."""
+    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)  # rounding may leave a coordinate past its bound
+    inside = high > low
+    x = np.zeros(len(low))
+    x[inside] = lsq_linear(A[:, inside], b, (low[inside], high[inside]), method="bvls").x
+    return x
 
 
 def _damped_matrices(A: np.ndarray, damping: float) -> list[np.ndarray]:

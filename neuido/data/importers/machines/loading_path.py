@@ -1,6 +1,7 @@
 """Preparation of a measured loading path: choice of rows, zero of the strain, block means, thinning and cycles."""
 
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,10 @@ TOE = (0.05, 0.2)
 SLACK = (0.02, 0.05, 0.5)
 """A specimen may hang loose where the stress stays below this share of the largest, over this share of the path or more, and grows less
 there than by this share of what it grows by over as much path again."""
+LEVEL, HELD, MOVES, SLOWER = 0.01, 0.8, 0.05, 1.5
+"""A stress is prescribed where it stays within the first share of its largest value over the second share of the rows, and where at a level
+the strain moves by the third share of its range, in the first half of the time by the last factor more than in the second half. A machine
+that prescribes the strain moves evenly there; creep and its recovery slow down."""
 CYCLES, ZEROS = ("together", "split"), ("none", "first", "toe")
 
 
@@ -237,3 +242,32 @@ def loading_parts(path: np.ndarray) -> list[Part]:
     returns = abs(path[0]) > abs(path[kept[1] - 1]) + REVERSAL * span  # it starts loaded
     names = ["unload" if i % 2 != returns else "load" for i in range(len(kept) - 1)]
     return [Part(f"{name}-{i // 2 + 1}", start, stop) for i, (name, start, stop) in enumerate(zip(names, kept, kept[1:]))]
+
+
+def holds_stress(columns: Mapping[str, np.ndarray]) -> bool:
+    """Return whether a test along one axis prescribes its stress: it stays at one or several levels while the strain follows ever slower.
+
+    A stress that yields may stay at a level too, but there the machine moves on at the same rate.
+    """
+    if "time" not in columns or len(columns) != 3:
+        return False
+    (path, stress), time = (values for key, values in columns.items() if key != "time"), columns["time"]
+    largest, size = float(np.abs(stress).max()), float(np.ptp(path))
+    if not (largest > 0 and size > 0):
+        return False
+    levels, start = [], 0
+    for i in range(1, len(stress) + 1):
+        if i == len(stress) or np.ptp(stress[start : i + 1]) > LEVEL * largest:
+            levels.append(slice(start, i))
+            start = i
+    held = [rows for rows in levels if rows.stop - rows.start >= 2 * LEAST_ROWS]
+    if sum(rows.stop - rows.start for rows in held) < HELD * len(stress):
+        return False
+
+    def creeps(rows: slice) -> bool:
+        e, t = path[rows], time[rows]
+        half = int(np.searchsorted(t, (t[0] + t[-1]) / 2))
+        early, late = abs(float(e[half] - e[0])), abs(float(e[-1] - e[half]))
+        return early + late > MOVES * size and early > SLOWER * late
+
+    return any(creeps(rows) for rows in held)

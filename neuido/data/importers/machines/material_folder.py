@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from neuido.data.files.parsing import naming
-from neuido.data.importers.machines.loading_path import LEAST_ROWS, Part, Preparation, loading_parts, prepare
+from neuido.data.importers.machines.loading_path import LEAST_ROWS, Part, Preparation, holds_stress, loading_parts, prepare
 from neuido.data.importers.machines.rheometer import read_curve, read_relaxation
 from neuido.data.importers.machines.testing_machine import MODES, MeasuredTest, Specimen, read_machine
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of, write_tables
@@ -20,6 +20,9 @@ START = 0.1
 """Share of the first loading whose slope is the modulus that a fit starts from."""
 FLOWS = 0.1
 """Slope at the start, relative to that of the whole first loading, below which the latter is taken."""
+
+ONE_AXIS = ("uniaxial", "equibiaxial", "pure_shear", "simple_shear")
+"""Modes in which the stress may be prescribed."""
 
 
 class Material(NamedTuple):
@@ -108,6 +111,9 @@ def write_material_tests(
             if left:
                 summary.append(f"{path.name}: {left} tables without strain and stress are left out")
     summary = said(notes) + summary
+    if all(test["mode"] in ONE_AXIS and "control" not in test for test in tests) and all(map(holds_stress, tables.values())):
+        tests = [test | {"control": "stress"} for test in tests]
+        summary.append("the stress stays at its levels while the strain follows: the stress is prescribed (control: stress in test.yaml)")
     roles = roles_of([test["name"] for test in tests], held_out, of_file)
     tests = [test | {"role": roles[test["name"]]} for test in tests]
     if len(tests) > 1:

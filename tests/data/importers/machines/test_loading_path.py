@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import neuido
-from neuido.data.importers.machines.loading_path import MAX_ROWS, Preparation, loading_parts, prepare
+from neuido.data.importers.machines.loading_path import MAX_ROWS, Preparation, holds_stress, loading_parts, prepare
 from neuido.data.importers.machines.material_folder import modulus
 from neuido.data.importers.machines.testing_machine import Specimen
 from neuido.errors import UserError
@@ -168,3 +168,42 @@ def test_a_strain_in_percent_without_a_unit_is_asked_for(tmp_path):
         neuido.import_file(path, None)
     path = write(tmp_path / "b.csv", ["Strain,Stress (MPa)", *(f"{e:.4f},{3 * e:.6f}" for e in SHEET)])
     assert any("taken as a ratio, up to 0.4" in line for line in neuido.import_file(path, None))
+
+
+def crept(t, level):
+    """A Burgers body under a stress that ends after 300 s."""
+
+    def compliance(t):
+        return np.where(t > 0, 1 / 30e6 + -np.expm1(-np.maximum(t, 0) / 40) / 25e6 + np.maximum(t, 0) / 9e9, 0.0)
+
+    return np.where((t > 0) & (t <= 300), level, 0.0), level * (compliance(t) - compliance(t - 300))
+
+
+def test_a_table_of_creep_prescribes_its_stress(tmp_path):
+    """A stress that stays at its levels was taken for a measured one, and two levels for repeats of one test."""
+    from neuido.discrepancy.problems.specimens.repeats import are_repeats, scatter
+
+    t = np.r_[np.linspace(0, 4, 9), np.geomspace(5, 300, 50), 300 + np.r_[np.linspace(1, 4, 5), np.geomspace(5, 300, 50)]]
+    files = []
+    for i, level in enumerate((2e5, 3e5)):
+        stress, strain = crept(t, level)
+        rows = [f"{a:.3f},{b / 1e6:.3f},{100 * c:.5f}" for a, b, c in zip(t, stress, strain, strict=True)]
+        files.append(write(tmp_path / f"step{i}.csv", ["Time (s),Stress (MPa),Strain (%)", *rows]))
+    said = neuido.import_file(files, tmp_path / "out")
+    assert any("the stress is prescribed" in line for line in said)
+    tests = neuido.read_material_tests(tmp_path / "out")
+    assert [test.control for test in tests.tests] == ["stress", "stress"]
+    assert not are_repeats(*tests.tests) and not scatter(tests)
+
+
+def test_a_stress_that_yields_or_relaxes_is_not_prescribed():
+    t = np.linspace(0, 100, 200)
+    stress, strain = crept(np.linspace(0, 250, 200), 2e5)
+    table = {"stretch": 1 + strain, "nominal_stress": stress, "time": t}
+    assert holds_stress(table)
+    assert not holds_stress({key: values for key, values in table.items() if key != "time"})
+    even = 0.1 * t / 100
+    assert not holds_stress(table | {"stretch": 1 + even, "nominal_stress": np.minimum(1e9 * even, 2e5)})
+    held = np.minimum(even, 0.01)
+    assert not holds_stress(table | {"stretch": 1 + held, "nominal_stress": 2e6 * held * (1 + np.exp(-t / 5))})
+    assert not holds_stress(table | {"stretch": 1 + even, "nominal_stress": 2e6 * even})
