@@ -44,7 +44,7 @@ def test_bodies_have_their_laws_and_colliders_their_surfaces(tmp_path, capsys):
         f"  - {{name: {name}, model: {model % young}, body: {{shape: ball, centre: [{x}, 0.4, 0.5], radius: 0.12, spacing: 0.04}}}}\n"
         for name, young, x in (("soft", "1.0e+4", 0.3), ("hard", "4.0e+4", 0.7))
     ) + SCENE[SCENE.index("discretisation:") :]  # fmt: skip
-    text = text.replace("gravity:", "colliders: [{kind: sphere, radius: 0.1, position: [0.3, 0.2, 0.5], contact: separate}]\n  gravity:")
+    text = text.replace("gravity:", "colliders: [{kind: sphere, radius: 0.1, position: [0.3, 0.15, 0.5], contact: separate}]\n  gravity:")
     (tmp_path / "two.yaml").write_text(text)
     status, _, err = run(capsys, "simulate", tmp_path / "two.yaml", "--out", tmp_path / "out", "--steps", 40, "--device", "cpu")
     assert status == 0, err

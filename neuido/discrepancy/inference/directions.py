@@ -6,7 +6,6 @@ import numpy as np
 
 from neuido.discrepancy.inference.floors import Floor
 from neuido.discrepancy.inference.laboratory import Laboratory
-from neuido.discrepancy.inference.least_squares import bounded_least_squares
 from neuido.discrepancy.problems.problem import Candidate, Parameter, Point
 from neuido.errors import UserError
 
@@ -112,11 +111,16 @@ def screen(lab: Laboratory, point: Point, candidates: Sequence[Candidate], floor
             B = project(columns[c.key, i])
             if not np.isfinite(B).all():
                 continue
-            sizes = c.size_parameters
             amount = -np.linalg.lstsq(B, left, rcond=1e-6)[0]
-            limits = np.array([_amounts(p, start[p.name], linear=c.linear) for p in sizes]).reshape(-1, 2).T
-            if ((amount < limits[0]) | (amount > limits[1])).any():
-                amount = bounded_least_squares(B, -left, *limits)
+            sizes = c.size_parameters
+            if not c.linear:
+                amount = np.clip(amount, 0.0, 1.5)
+            for k, p in enumerate(sizes):
+                if start[p.name] == 0:  # this size does nothing, so its column is zero
+                    amount[k] = 0.0
+                    continue
+                low, high = (p.lower / start[p.name], p.upper / start[p.name])
+                amount[k] = np.clip(amount[k], min(low, high), max(low, high))
             share_left = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
             if c.linear:
                 factor = np.clip(amount, -4.0, 4.0)
@@ -126,14 +130,6 @@ def screen(lab: Laboratory, point: Point, candidates: Sequence[Candidate], floor
             ranked.append((share_left, c, i, dict(point) | c.times(start, factor)))
     ranked.sort(key=lambda entry: entry[0])
     return ranked, columns
-
-
-def _amounts(p: Parameter, size: float, *, linear: bool) -> tuple[float, float]:
-    """Return the least and the largest factor of a start's size; of a size of zero, which does nothing, and of what is not linear, less."""
-    if size == 0:
-        return 0.0, 0.0
-    low, high = sorted((p.lower / size, p.upper / size))
-    return (low, high) if linear else (max(low, 0.0), min(high, 1.5))
 
 
 def project_out_slopes(lab: Laboratory, slopes: Mapping[int, np.ndarray], floor: Floor) -> Callable[[Mapping[int, np.ndarray]], np.ndarray]:

@@ -284,15 +284,16 @@ def _bounded(H: np.ndarray, g: np.ndarray, low: np.ndarray, high: np.ndarray) ->
     """Return the step x (p,) with the least x^T H x / 2 + g^T x between `low` and `high`."""
     values, vectors = np.linalg.eigh(H)
     root = np.sqrt(np.maximum(values, 1e-14 * max(values[-1], 1e-300)))
+    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)  # rounding may leave a coordinate past its bound
     return bounded_least_squares(root[:, None] * vectors.T, -(vectors.T @ g) / root, low, high)
 
 
 def bounded_least_squares(A: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the x (p,) between `low` and `high` for which A x is nearest to b."""
-    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)  # rounding may leave a coordinate past its bound
     inside = high > low
-    x = np.zeros(len(low))
-    x[inside] = lsq_linear(A[:, inside], b, (low[inside], high[inside]), method="bvls").x
+    x = np.array(low, dtype=np.float64)
+    if inside.any():
+        x[inside] = lsq_linear(A[:, inside], b - A[:, ~inside] @ x[~inside], (low[inside], high[inside]), method="bvls").x
     return x
 
 

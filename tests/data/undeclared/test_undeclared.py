@@ -20,7 +20,7 @@ from neuido.data.undeclared.motion import Motion, Solver, simulate_motion
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, truth_entry
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import LIBRARY
-from neuido.physics.effects.point_library import POINT_ENTRIES
+from neuido.physics.effects.point_library import PLANE_ENTRIES, POINT_ENTRIES
 from neuido.physics.fem.particle_weights import interpolation_weights
 from neuido.types import Plane, Scene
 
@@ -163,7 +163,7 @@ def test_what_cannot_be_made_is_refused(tmp_path, option):
 def test_kinds_cover_the_vocabulary_and_what_is_outside_is_outside():
     names = {entry.name for entry in LIBRARY}
     of_tracks = {entry.name for entry in LIBRARY if entry.only == "track"}
-    of_points = {entry.name for entry in POINT_ENTRIES}  # of material tests
+    of_points = {entry.name for entry in (*POINT_ENTRIES, *PLANE_ENTRIES)}  # of material tests and plane specimens
     assert names - of_tracks - of_points <= {kind.partition(":")[0] for kind in KINDS} <= names and of_tracks <= set(GUIDED.values())
     assert not names & set(OUTSIDE) and len(OUTSIDE) >= 4
     scales = Scales(1e5, 1000.0, 0.3, np.full(3, 0.12), np.full(3, 0.4), 0.5, 1.5, 5e-4, 1 / 32, 5e3)

@@ -10,7 +10,7 @@ from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, NeoHook
 from neuido.physics.mpm import reference
 from neuido.physics.mpm.kernels import transfers as kernels
 from neuido.physics.mpm.plan import Plan
-from neuido.physics.mpm.rollout import to_grid
+from neuido.physics.mpm.rollout import add_to_grid
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Box, ParticleState, Plane, Scene, Walls
 from tests.physics.bodies import DEVICE, DEVICES, block, busy_scenes, same
@@ -141,7 +141,9 @@ class Stage:
 
     def grid(self):
         x, v, C, _ = self.state
-        return to_grid(self.plan, x, v, C, self.tau, self.sim.mass, self.sim.room.scratch("grid")).clone()
+        grid = self.sim.room.scratch("grid").zero_()
+        add_to_grid(self.plan, x, v, C, self.tau, self.sim.mass, grid)
+        return grid.clone()
 
 
 def kernel_cases(stage: Stage):
