@@ -86,7 +86,7 @@ def test_loop(tmp_path, monkeypatch):
     assert result.parameters["drag_linear.k"] == pytest.approx(3.0, rel=0.1)
     assert result.after < 1.3 * result.floor < 0.5 * result.before
     assert matplotlib.image.imread(result.picture).std() > 0.05
-    check_page(tmp_path / "report.html", ("drag_linear.k = 3", "effect: drag_linear", "diagnosis/report.html"), 1)
+    check_page(tmp_path / "report.html", ("drag_linear.k = 3", "effect: linear air drag (drag_linear)", "diagnosis/report.html"), 1)
 
 
 def test_page_shows_the_scenes(tmp_path):

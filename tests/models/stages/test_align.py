@@ -43,7 +43,8 @@ def trainer(tmp_path, **options):
 
 @pytest.mark.slow
 def test_training_lowers_the_loss_and_finds_the_stiffness(vae, tmp_path):
-    model = module(vae, curriculum=[], save_to=str(tmp_path / "encoder.safetensors"), cache=str(tmp_path / "flow"))
+    options = {"operator": "pretrained-objective", "curriculum": [], "cache": str(tmp_path / "flow")}
+    model = module(vae, save_to=str(tmp_path / "encoder.safetensors"), **options)
     frozen = {name: p.clone() for name, p in model.named_parameters() if "projector" not in name}
     data = TinyScenes(str(tmp_path), youngs=(5e4,))
     prepared = model.prepared(data.scenes[0])
