@@ -30,6 +30,8 @@ CLOCK = re.compile(
 """Time as hours:minutes:seconds or minutes:seconds, with a date before it, and hundredths of a second or frames after it."""
 BROKEN, WORD, THOUSANDS = 2.0, 1.5, 0.01
 """What a cell takes from the score of a dialect: a broken number, a word (a name may be a column), and 1.250 read as 1250."""
+BLOCK = "point"
+"""Title of the column that names the trajectory of each row, where a file has one trajectory below the other."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -74,6 +76,9 @@ def read_delimited(path: Path) -> Delimited:
             lines.append(i)
     titles = _titles_in_comment(text, rows, lines, separator)
     if titles is not None:
+        blocks = _blocks(text, titles, rows, lines)
+        if len(set(blocks)) > 1:
+            titles, rows = (titles[0], [*titles[1], BLOCK]), [[*row, name] for row, name in zip(rows, blocks)]
         rows, lines = [titles[1], *rows], [titles[0], *lines]
     return Delimited(rows, lines, encoding, separator, decimal)
 
@@ -96,6 +101,35 @@ def _titles_in_comment(text: str, rows: list[list[str]], lines: list[int], separ
             if named and len(cells) == len(rows[0]) and len(cells) > 1 and not any(is_number(cell) for cell in cells) and all(cells):
                 return number, cells
     return None
+
+
+def _blocks(text: str, titles: tuple[int, list[str]], rows: list[list[str]], lines: list[int]) -> list[str]:
+    """Return the name of the trajectory of each row of a file for gnuplot, as Kinovea writes it: `# name`, its rows, and blank lines.
+
+    Without names, two blank lines begin a trajectory, and so does one if the times start again below it.
+    """
+    if not {"t", "x"} <= {cell.lower() for cell in titles[1]}:
+        return [""] * len(rows)
+    at = [cell.lower() for cell in titles[1]].index("t")
+    every = [line.strip() for line in text.splitlines()]
+    gaps = [every[a:b] for a, b in zip([titles[0], *lines], [line - 1 for line in lines])]
+    names = [next((line.lstrip("# ") for line in reversed(gap) if line.startswith("#")), "") for gap in gaps]
+    out, named = list[str](), bool(names[0])
+    for i, (gap, name) in enumerate(zip(gaps, names)):
+        begins = not i or (bool(name) if named else len(gap) > 1 or (len(gap) == 1 and _before(rows[i], rows[i - 1], at)))
+        if begins:
+            count = len(dict.fromkeys(out))
+            own = name if named else f"point {count + 1}"
+            out.append(f"{own} ({count + 1})" if own in out else own)
+        else:
+            out.append(out[-1])
+    return out
+
+
+def _before(row: list[str], other: list[str], column: int) -> bool:
+    """Whether the time of a row is not after that of another one; clocks are compared as text of the same length."""
+    a, b = (cells[column] if column < len(cells) else "" for cells in (row, other))
+    return float(a) <= float(b) if is_number(a) and is_number(b) else (len(a), a) <= (len(b), b)
 
 
 def _decoded(path: Path) -> tuple[str, str]:

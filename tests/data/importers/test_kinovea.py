@@ -50,9 +50,25 @@ def test_the_text_of_trajectories(tmp_path, decimal):
     (tmp_path / "one.txt").write_text("\r\n".join(one), newline="")
     neuido.import_file(tmp_path / "one.txt", tmp_path / "one", **GIVEN)
     same(tmp_path / "one", "one")
-    (tmp_path / "two.txt").write_text("\r\n".join([*one, "# Marker 2", *(row.replace(" ", " 9") for row in rows), ""]), newline="")
-    with pytest.raises(UserError, match=r"the times start again at data row 31: .* or give each a file"):
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("later", [0, 5, 10_000])
+def test_the_text_of_several_trajectories(tmp_path, named, later):
+    """The second one begins with the first, while it goes on, or after it, where the times alone would not tell them apart."""
+    second = [f"{float(t) + later:.7g} 9{x} {y}" for t, x, y in CENTIMETRES]
+    heads = ["# Marker 1", "# Marker 2"] if named else ["", ""]
+    blocks = [[heads[0], *map(" ".join, CENTIMETRES), "", ""], [heads[1], *second, "", ""]]
+    (tmp_path / "two.txt").write_text("\n".join(["#Kinovea Trajectory data export", "#T X Y", *blocks[0], *blocks[1]]))
+    names = ["Marker 1", "Marker 2"] if named else ["point 1", "point 2"]
+    with pytest.raises(UserError, match=f"has the points {', '.join(names)}: select one with --point"):
         neuido.import_file(tmp_path / "two.txt", tmp_path / "two", **GIVEN)
+    neuido.import_file(tmp_path / "two.txt", tmp_path / "two", point=names[0], **GIVEN)
+    same(tmp_path / "two", "two")
+    neuido.import_file(tmp_path / "two.txt", tmp_path / "each", columns={"recording": "point"}, **GIVEN)
+    first, last = neuido.read_tracks(tmp_path / "each").recordings
+    assert len(first.t) == len(last.t) == len(T)
+    np.testing.assert_allclose(first.x, FLIGHT[:, :2], atol=1e-6)
 
 
 @pytest.mark.parametrize("row", ["0.033;1.250;2.250", "1.033;1.250;2.250", "1,033\t1,250\t2,250", '"0,033","1,250","2,250"'])
