@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from neuido.commands.engines.outcome import Share
-from neuido.commands.engines.task_folder import MARK, finish, finished, is_address, joined, local_copy, written
+from neuido.commands.engines.task_folder import begin, finish, finished, is_address, joined, local_copy, written
 from neuido.commands.engines.tasks import check_engine, map_tasks
 from neuido.data.files.score_tables import write_rows
 from neuido.data.files.writing import check_writable
@@ -30,9 +30,8 @@ def diagnose_folder(folder: str, out: str, options: dict[str, Any]) -> dict[str,
         if options["resume"] and (row := finished(out, digest)) is not None:
             return row
         begun = time.monotonic()
+        begin(out)
         with written(out) as target:
-            if not is_address(out):
-                (target / MARK).unlink(missing_ok=True)
             found = workflow.diagnose(place, out=target, **options)
             bodies = found.bodies.values()
             row = {

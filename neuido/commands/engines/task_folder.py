@@ -73,6 +73,17 @@ def written(out: str) -> Iterator[Path]:
                 system.put_file(str(path), f"{place}/{name}")
 
 
+def begin(out: str) -> None:
+    """Take the mark of an earlier task away, so that no cut result passes for a whole one."""
+    if not is_address(out):
+        (Path(out) / MARK).unlink(missing_ok=True)
+        return
+    system, place = _system(out)
+    with _told(out):
+        if system.exists(f"{place}/{MARK}"):
+            system.rm_file(f"{place}/{MARK}")
+
+
 def finish(out: str, digest: str, value: Any) -> None:
     """Mark a task as done, after all that it wrote."""
     content = {"format": "neuido-task/1", "digest": digest, "value": value}
@@ -87,6 +98,8 @@ def finish(out: str, digest: str, value: Any) -> None:
 def _system(path: str) -> tuple[Any, str]:
     """Return the file system of an address, and the place in it."""
     fsspec = import_extra("fsspec", f"the address {path}", extra="scale")
+    if path.startswith(("s3://", "s3a://")):
+        import_extra("s3fs", f"the address {path}", extra="s3")
     try:
         return fsspec.core.url_to_fs(path)
     except (ImportError, ValueError) as error:
