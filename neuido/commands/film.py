@@ -26,6 +26,7 @@ def film(
     shapes: str = "seen",
     published: bool = False,
     held_out: float = 0.0,
+    speeds: list[float] = [0.5, 3.0],  # noqa: B006 (read only)
     device: str = "auto",
     batch: int = 0,
     shard: int = 0,
@@ -62,6 +63,7 @@ def film(
         shapes: Group of shapes of the bodies: seen, held-out or unseen; no two groups share a shape.
         published: Use the ten bodies of the literature too; their particles lie in NEUIDO_DATA.
         held_out: Fraction of the clips, the last ones, whose bodies have the shapes held-out while the others' are seen.
+        speeds: Smallest and largest downward speed of a throw, m/s. A body shows how it differs from others where it strains.
         device: auto, cpu or cuda.
         batch: Clips simulated in one launch; 0: 1 on the CPU and 16 on a GPU.
         shard: Number of the shard to film, from 0; shards may be filmed at the same time into one folder.
@@ -96,6 +98,7 @@ def film(
         shapes=shapes,
         published=published,
         held_out=held_out,
+        speeds=tuple(speeds),  # type: ignore[arg-type]
     )
     if engine is None:
         generate_clips(plan, out, device=device, batch=batch, shard=shard, shards=shards, progress=progress)

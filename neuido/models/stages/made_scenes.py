@@ -121,7 +121,7 @@ class MadeSceneDataModule(LightningDataModule):
 def _plan_of(content: dict[str, Any], root: str | os.PathLike) -> ClipPlan:
     """Return the plan of an index.json."""
     try:
-        lists = {name: tuple(content[name]) for name in ("dts",)} | {
+        lists = {name: tuple(content[name]) for name in ("dts", "speeds") if name in content} | {
             "rates": None if content.get("rates") is None else tuple(content["rates"])
         }
         families = {family: {name: tuple(pair) for name, pair in ranges.items()} for family, ranges in content["families"].items()}

@@ -77,6 +77,36 @@ def _limbs(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
     return trunk | (distance < random.uniform(0.12, 0.3, 4)).any(1)
 
 
+def _superquadric(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
+    """Return a superquadric, from a rounded octahedron to a rounded box."""
+    round_, flat = random.uniform(1.2, 6.0, 2)
+    across = (np.abs(x[:, 0]) ** round_ + np.abs(x[:, 2]) ** round_) ** (flat / round_)
+    return across + np.abs(x[:, 1]) ** flat < 1
+
+
+def _assembly(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
+    """Return turned superquadrics, added to the first one or cut out of it in turn."""
+    inside = _part(random, x, 0.45, 0.75, 0.15)
+    for _ in range(random.integers(1, 5)):
+        part = _part(random, x, 0.2, 0.55, 0.5)
+        cut = inside & ~part
+        inside = cut if random.random() < 0.35 and cut.sum() > 0.5 * inside.sum() else inside | part
+    return inside
+
+
+def _part(random: np.random.Generator, x: np.ndarray, least: float, largest: float, away: float) -> np.ndarray:
+    turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
+    return _superquadric(random, (x - random.uniform(-away, away, 3)) @ turn / random.uniform(least, largest, 3))
+
+
+def _relief(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
+    """Return a ball whose radius varies as a sum of waves."""
+    waves, phases = random.standard_normal((6, 3)) * random.uniform(1.0, 4.0), random.uniform(0, 2 * math.pi, 6)
+    distance = np.linalg.norm(x, axis=1)
+    bumps = np.sin(x / distance[:, None].clip(1e-9) @ waves.T + phases).sum(1) / 6
+    return distance < 0.65 + random.uniform(0.2, 0.9) * bumps.clip(-0.5, 0.38)
+
+
 def _pyramid(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
     return np.abs(x[:, [0, 2]]).max(1) < 0.5 * (1 - x[:, 1])
 
@@ -117,7 +147,8 @@ def _radius(x: np.ndarray) -> np.ndarray:
 
 SOLIDS: dict[str, dict[str, Inside]] = {
     "seen": {"ball": _ball, "box": _box, "cylinder": _cylinder, "cone": _cone, "torus": _torus, "capsule": _capsule, "wedge": _wedge,
-             "dumbbell": _dumbbell, "blob": _blob, "limbs": _limbs},
+             "dumbbell": _dumbbell, "blob": _blob, "limbs": _limbs, "superquadric": _superquadric, "assembly": _assembly,
+             "relief": _relief},
     "held-out": {"pyramid": _pyramid, "cross": _cross},
     "unseen": {"star": _star, "mushroom": _mushroom, "hourglass": _hourglass, "table": _table, "arch": _arch},
 }  # fmt: skip
@@ -128,8 +159,8 @@ PUBLISHED: dict[str, tuple[str, ...]] = {
     "unseen": ("sand-fish", "rubber-pawn", "real-dog"),
 }
 """The ten bodies of the literature, of which NEUIDO_DATA has the particles, in each group."""
-WEIGHTS = {"blob": 2, "limbs": 4}
-"""How much more often than others a kind of solid is drawn; limbs bend and so reveal stiffness where a trunk does not."""
+WEIGHTS = {"blob": 2, "limbs": 4, "superquadric": 2, "assembly": 8, "relief": 4}
+"""How much more often than others a kind of solid is drawn: no two assemblies are alike, and limbs bend where a trunk does not."""
 
 
 def random_body(
@@ -207,13 +238,16 @@ def _evenly(points: np.ndarray, spacing: float, filling: np.random.Generator) ->
     return points[np.unique(place @ np.array([10**10, 10**5, 1]), return_index=True)[1]]
 
 
-def launch(random: np.random.Generator, x: np.ndarray, duration: float) -> tuple[np.ndarray, Vector, Vector]:
+def launch(
+    random: np.random.Generator, x: np.ndarray, duration: float, speeds: tuple[float, float] = (0.5, 3.0)
+) -> tuple[np.ndarray, Vector, Vector]:
     """Sample a drop, a throw or a spinning throw of a body that meets the floor within the first third of a film.
 
     Args:
         random: Source of randomness.
         x: Particles about the origin [m], (P, 3).
         duration: Length of the film [s].
+        speeds: Smallest and largest downward speed of a throw [m/s].
 
     Returns:
         How far to move the particles above the floor y = 0 [m], (3,), the velocity [m/s] and the angular velocity [rad/s].
@@ -224,7 +258,7 @@ def launch(random: np.random.Generator, x: np.ndarray, duration: float) -> tuple
     if kind == "drop":
         height, v = min(0.5 * 9.8 * flight**2, room), (0.0, -random.uniform(0.0, 0.3), 0.0)
     else:
-        down, side = random.uniform(0.5, 3.0), 0.5 if duration < 0.5 else 1.0
+        down, side = random.uniform(*speeds), 0.5 if duration < 0.5 else 1.0
         height = min(down * flight + 0.5 * 9.8 * flight**2, room)
         v = (random.uniform(-side, side), -down, random.uniform(-side, side))
     spin = tuple(random.uniform(-1, 1, 3) * {"drop": 0.0, "throw": 3.0, "spin": 8.0}[kind])

@@ -61,6 +61,7 @@ class ClipPlan:
     shapes: str = "seen"
     published: bool = False
     held_out: float = 0.0
+    speeds: tuple[float, float] = (0.5, 3.0)
 
     def __post_init__(self) -> None:
         for name, least in (("count", 1), ("views", 1), ("frames", 5), ("frame_steps", 1), ("cells", 4), ("particles", 8), ("samples", 1)):
@@ -76,6 +77,8 @@ class ClipPlan:
             raise UserError(
                 f"shapes = {self.shapes!r} must be one of {', '.join(GROUPS)}, and held_out = {self.held_out} from 0 to below 1"
             )
+        if not (len(self.speeds) == 2 and 0 <= self.speeds[0] <= self.speeds[1] < math.inf):
+            raise UserError(f"speeds = {list(self.speeds)} must be the smallest and the largest speed of a throw in m/s, such as [0.5, 3]")
         if not self.families:
             raise UserError(f"families is empty: name at least one of {', '.join(PARAMETERS)}")
         for family, ranges in self.families.items():
@@ -227,7 +230,7 @@ def sample_clip(plan: ClipPlan, number: int, *, fill: int = 0) -> ClipSetup:
     shape, points, volume = random_body(_source(plan, number, "body"), *plan.body_options(number))
     random = _source(plan, number, "film")
     scene = Scene(cells=plan.cells, dt=dt, walls=Walls(friction=float(random.choice(FLOORS))))
-    lift, velocity, spin = launch(random, points, dt * steps * (plan.frames - 1))
+    lift, velocity, spin = launch(random, points, dt * steps * (plan.frames - 1), plan.speeds)
     centre = tuple((points.mean(0) + lift).tolist())
     if fill:
         _, points, volume = random_body(_source(plan, number, "body"), *plan.body_options(number), fill=fill)
