@@ -32,6 +32,7 @@ from neuido.models.video.clip_generation import ClipPlan
 from neuido.models.video.encoder import DynamicsEncoder
 from neuido.models.video.flow import Velocities
 from neuido.models.video.material_properties import LOGARITHMIC
+from neuido.models.video.reader import Readings
 
 RANDOM = 3
 """Random latents of a scene, of whose Chamfer distances the median is taken."""
@@ -89,13 +90,17 @@ def main() -> None:
 def read(encoder: DynamicsEncoder, volume, conditions, clip, seen: Velocities) -> dict[str, Any]:
     """Return what the reader says beside the truth; and whether the same film backwards is found to be unlike the training."""
     truth = properties_of(clip.family, clip.parameters)
-    row: dict[str, Any] = dict(truth)
     found = encoder.read(volume, conditions)
     if found is None:
-        return row
+        return dict(truth)
     backwards = encoder.read(*encoder.embed(seen._replace(flow=-seen.flow.flip(1))))
-    row |= {"family_read": found.family, "probability": found.families[found.family], "novelty": found.novelty, "limit": found.limit}
-    row |= {"unlike": int(found.unlike), "backwards_unlike": int(backwards.unlike)}
+    return truth | compared(found, truth) | {"backwards_unlike": int(backwards.unlike)}
+
+
+def compared(found: Readings, truth: dict[str, float]) -> dict[str, Any]:
+    """Return what was read, and whether the truth is inside the intervals."""
+    row: dict[str, Any] = {"family_read": found.family, "probability": found.families[found.family], "unlike": int(found.unlike)}
+    row |= {"novelty": found.novelty, "limit": found.limit}
     for one in found.properties:
         row[f"{one.name}_read"], row[f"{one.name}_low"], row[f"{one.name}_high"] = one.value, one.low, one.high
         if one.name in truth:
@@ -108,23 +113,28 @@ def motions(prepared: PreparedScene, operator: IntrinsicDynamicsOperator, z, cli
     elastic, plastic = laws(clip.family, [clip.parameters])
     rates = effects(clip.family, [clip.parameters])
     row = {"modulus": float(elastic.modulus()), "modulus_law": float(p_wave_modulus(operator, z[None])[0].detach())}
-    runs = {"true": [lambda scene: rollout_laws(scene, (elastic, plastic), scene.frames, effects=rates)]}
+    row["cd_true"] = chamfer_of(prepared, lambda scene: rollout_laws(scene, (elastic, plastic), scene.frames, effects=rates), 2)
     mean = operator.latents.mean(0)
     drawn = operator.random_latents(RANDOM, torch.Generator().manual_seed(0))
-    for name, latents in (("read", [z]), ("mean", [mean]), ("random", drawn)):
-        runs[name] = [lambda scene, own=own: rollout_latent(scene, operator, own.to(z)) for own in latents]
-    for name, own in runs.items():
-        found = []
-        for run in own:
-            try:
-                with torch.no_grad():
-                    motion, _ = rollout_with_retries(prepared, run, 2 if name in ("true", "read") else 0)
-                found.append(float(chamfer_per_frame(prepared, motion).mean()))
-            except UserError:
-                found.append(math.inf)
-        row[f"cd_{name}"] = statistics.median(found)
+    for name, latents, retries in (("read", [z], 2), ("mean", [mean], 0), ("random", list(drawn), 0)):
+        row[f"cd_{name}"] = chamfer(prepared, operator, [own.to(z) for own in latents], retries)
     row["cd_ratio"] = row["cd_read"] / row["cd_true"]
     return row
+
+
+def chamfer(prepared: PreparedScene, operator: IntrinsicDynamicsOperator, latents: list[torch.Tensor], retries: int) -> float:
+    """Return the median Chamfer distance with the laws of latents."""
+    return statistics.median(chamfer_of(prepared, lambda scene, own=own: rollout_latent(scene, operator, own), retries) for own in latents)
+
+
+def chamfer_of(prepared: PreparedScene, run, retries: int) -> float:
+    """Return the mean Chamfer distance of a rollout; infinity if no time step makes it run."""
+    try:
+        with torch.no_grad():
+            motion, _ = rollout_with_retries(prepared, run, retries)
+        return float(chamfer_per_frame(prepared, motion).mean())
+    except UserError:
+        return math.inf
 
 
 def summarise(rows: list[dict[str, Any]], title: str) -> str:
