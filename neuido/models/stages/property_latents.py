@@ -53,7 +53,7 @@ def property_latents(operator: IntrinsicDynamicsOperator) -> dict[str, FamilyLat
         UserError: The card of the operator does not say which materials it was trained on, or says of others.
     """
     families: dict[str, FamilyLatents] = {}
-    found = {name: (family, parameters) for name, family, parameters in _materials(operator)}
+    found = {name: (family, parameters) for name, family, parameters in materials_of(operator)}
     for family in dict.fromkeys(operator.latent_families):
         own = [name for name, each in zip(operator.latent_names, operator.latent_families) if each == family]
         if not set(own) <= set(found):
@@ -73,7 +73,7 @@ def _kernel(a: Tensor, b: Tensor) -> Tensor:
     return (-torch.cdist(a, b).square() / (2 * LENGTH**2)).exp()
 
 
-def _materials(operator: IntrinsicDynamicsOperator) -> list[tuple[str, str, dict[str, float]]]:
+def materials_of(operator: IntrinsicDynamicsOperator) -> list[tuple[str, str, dict[str, float]]]:
     """Return name, family and parameters of the materials that the card of an operator says it was trained on."""
     content = operator.card.get("data")
     if not isinstance(content, dict) or not operator.latent_names:
