@@ -15,7 +15,7 @@ def operator():
 
 
 @pytest.mark.parametrize(
-    "family, parameters",
+    ("family", "parameters"),
     [
         ("elastic", {"young": 1.5e5, "poisson": 0.28}),
         ("foam", {"young": 9e4, "poisson": 0.11, "exponent": 3.5}),
