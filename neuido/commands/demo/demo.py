@@ -1,5 +1,6 @@
 """The `demo` command: laws learned from simulated bodies, a law read from video, one closed loop, and a page that shows them."""
 
+import base64
 import os
 import time
 from pathlib import Path
@@ -11,20 +12,22 @@ from neuido.errors import UserError
 
 if TYPE_CHECKING:
     from neuido.commands.demo.closed_loop import LoopResult
+    from neuido.commands.demo.filmed_duck import Reading
     from neuido.commands.demo.law_from_video import Adapted, VideoResult
     from neuido.commands.demo.learned_laws import LawsResult
 
-PARTS = ("laws", "video", "loop")
-MADE = ("trajectories", "lightning_logs", "csv", "demo.png", "video", "loop", "report.html")
+PARTS = ("reading", "laws", "video", "loop")
+MADE = ("reading", "trajectories", "lightning_logs", "csv", "demo.png", "video", "loop", "report.html")
 """What a demonstration leaves in its folder; that of an earlier version has no demo.json."""
 
 
-def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "laws,video,loop") -> None:
+def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "reading,laws,video,loop") -> None:
     """Learn laws from simulated bodies, read a law from video, and find an effect that a model lacks; minutes on a CPU.
 
-    Three parts: `laws` trains the operator on small trajectories and compares the motion under its laws with the true one (Stage I);
-    `video` films small bodies, trains Stage II on two of them and reads the law of a third in one pass; `loop` diagnoses a small
-    experiment whose model lacks an effect. Writes tables, pictures and one page, <out>/report.html.
+    Four parts: `reading` films a rubber duck and reads its stiffness in one pass of the shipped encoder; `laws` trains the operator on
+    small trajectories and compares the motion under its laws with the true one (Stage I); `video` films small bodies, trains Stage II on
+    two of them and reads the law of a third in one pass; `loop` diagnoses a small experiment whose model lacks an effect. Writes tables,
+    pictures and one page, <out>/report.html.
 
     Args:
         out: Folder for runs, pictures and the page.
@@ -50,13 +53,19 @@ def demo(*, out: str = "runs/demo", settings: str = "quickstart", parts: str = "
         with one_thread_each():
             for part in (part for part in PARTS if part in chosen):
                 begun = time.monotonic()
-                body = {"laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
+                body = {"reading": _reading, "laws": _laws, "video": _video, "loop": _loop}[part](folder, settings)
                 spent = time.monotonic() - begun
                 print(f"{part}: {spent:.0f} s\n", flush=True)
                 sections.append(f'{body}<p class="note">{spent:.0f} s.</p>')
         target = folder / "report.html"
         _write(target, "\n".join(sections))
         print(f"results in {folder}: open {target}")
+
+
+def _reading(folder: Path, settings: str) -> str:
+    from neuido.commands.demo.filmed_duck import demo_reading
+
+    return reading_section(demo_reading(str(folder / "reading")))
 
 
 def _laws(folder: Path, settings: str) -> str:
@@ -75,6 +84,21 @@ def _loop(folder: Path, settings: str) -> str:
     from neuido.commands.demo.closed_loop import demo_loop
 
     return loop_section(demo_loop(str(folder / "loop")), folder)
+
+
+def reading_section(result: "Reading") -> str:
+    """Format the law that was read of the duck as HTML, with its video."""
+    rows = [
+        ("Young's modulus that was read [kPa]", result.young / 1e3),
+        ("its 90 % interval [kPa]", f"{result.low / 1e3:.3g} to {result.high / 1e3:.3g}"),
+        ("true, not told [kPa]", result.true / 1e3),
+        ("particles from the true motion, RMS [mm]", 1e3 * result.rmse),
+        ("from images to law [s]", result.seconds),
+    ]
+    text = "A rubber duck falls before two cameras. One pass of the encoder reads its law, and a simulation with this law is filmed again."
+    source = f"data:video/mp4;base64,{base64.b64encode(result.video.read_bytes()).decode()}"
+    shown = f'<video controls loop muted playsinline style="max-width:100%" src="{source}"></video>'
+    return f"<h2>A law read from a film</h2><p>{text}</p>{table(('', ''), rows, digits=3)}{shown}{picture(result.picture)}"
 
 
 def laws_section(result: "LawsResult") -> str:
