@@ -200,9 +200,9 @@ def page() -> str:
         "`neuido predict --config configs/experiments/transfer.yaml` writes the videos. The paper gives no figures.\n\n"
         "## Figure 7: the latents\n\nt-SNE and interpolation are on [the page of the latents](latents.md): "
         "`neuido latents --config configs/experiments/latent_space.yaml`.\n\n"
-        "## Not run\n\nThe comparison with Spring-Gaus on its real recordings (Figure 4 and 12 a), which are not at "
-        "hand, and curves of CD over time as a\n"
-        "figure (Figure 10): `neuido fit` and `neuido test` write them to `frames.csv` of each scene.\n",
+        "## Figure 10: CD over time\n\n`neuido report RUN ...` draws it from `frames.csv` of each scene of the runs; the page of a sweep, "
+        "`runs/sweeps/table1/report.html`,\nhas it for all methods.\n",
+        "## Not run\n\nThe comparison with Spring-Gaus on its real recordings (Figure 4 and 12 a), which are not at hand.\n",
     ]
     return "\n".join(parts)
 
