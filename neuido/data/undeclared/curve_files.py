@@ -30,6 +30,21 @@ def drawn_effect(
     return found.rounded()
 
 
+def drawn_effects(
+    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
+) -> list[Drawn]:
+    """Return the effects of a kind, two for "first+second", each of which alone moves the data by about `target` times the noise."""
+    found = [drawn_effect(rng, one, sizes, target, noise, separation) for one in kind.split("+")]
+    return [one for one in found if one is not None]
+
+
+def outside_entry(drawn: Drawn, meaning: str, units: Mapping[str, str], near: tuple[str, ...]) -> dict[str, Any]:
+    """Describe an effect that the library cannot express for the list `undeclared` of the key of a case."""
+    values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
+    return {"kind": drawn.kind, "diagnosis_names": [], "parameters": values, "sizes": [name.partition(".")[2] for name in drawn.sizes],
+            "units": dict(units), "meaning": meaning, "outside_library": True, "near": list(near)}  # fmt: skip
+
+
 def key_rows(true: list[np.ndarray], plain: list[np.ndarray], noise: float, roles: list[str], names: list[str], unit: str) -> list[dict]:
     """Return what the key says of each recording: how far the effect moves it."""
     rows = []

@@ -13,9 +13,9 @@ import yaml
 from neuido.data.files.writing import write_text
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.curve_files import Sizes, drawn_effect, key_rows, write_csv, write_tests
+from neuido.data.undeclared.curve_files import Sizes, drawn_effects, key_rows, outside_entry, write_csv, write_tests
 from neuido.data.undeclared.laboratory_tests import form_of
-from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, truth_entry
+from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth_entry
 from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
@@ -31,8 +31,17 @@ TEST_KINDS = ("viscosity_shear", "maxwell", "hysteresis", "strain_stiffening", "
 YIELDING = ("hardening", "kinematic_hardening", "rate_yield", "nonlinear_backstress", "cyclic_hardening", "rate_power")
 """Effects of a body that is declared as one that yields."""
 TRACK_KINDS = ("gravity", "uniform_acceleration", "drag_linear", "drag_quadratic", "magnus", "position_force")
+TEST_PAIRS = ("viscosity_shear+strain_stiffening", "maxwell+mullins", "hysteresis+second_invariant", "hardening+nonlinear_backstress",
+              "rate_power+kinematic_hardening", "maxwell+strain_stiffening")  # fmt: skip
+TRACK_PAIRS = ("drag_quadratic+uniform_acceleration", "drag_linear+magnus", "gravity+drag_quadratic", "drag_quadratic+magnus")
+TEST_OUTSIDE, TRACK_OUTSIDE = ("swinging_stiffness",), ("dry_drag",)
+"""Effects that the library cannot express in a test or in a free flight."""
+PAIR, OUTSIDE = 0.2, 0.1
+"""Shares of pairs and of effects outside the library among the cases with an effect."""
 PERIOD = 2.0
 """Period of the loading of a specimen [s]."""
+SWING = 0.37
+"""Period of `swinging_stiffness` over that of the loading."""
 
 
 def curve_case(
@@ -49,19 +58,29 @@ def curve_case(
     for option in ("solver", "nuisances", "particles", "seconds"):
         if getattr(case, option):
             raise UserError(f"case.{option} = {getattr(case, option)} applies to bodies only: remove it, or give case.measured = body")
-    kinds = TEST_KINDS if case.measured == "material_test" else TRACK_KINDS
+    tests = case.measured == "material_test"
+    singles, pairs, outside = (TEST_KINDS, TEST_PAIRS, TEST_OUTSIDE) if tests else (TRACK_KINDS, TRACK_PAIRS, TRACK_OUTSIDE)
+    kinds = (*singles, *pairs, *outside)
     if case.kind is not None and case.kind != "none" and case.kind not in kinds:
         raise UserError(f"case.kind = {case.kind!r} does not suit case.measured = {case.measured}: choose from none, {', '.join(kinds)}")
-    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(kinds)))
+    kind = case.kind or _drawn_kind(rng, singles, pairs, outside)
     ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
     return (_test if case.measured == "material_test" else _track)(rng, kind, ratio, name, advance)
+
+
+def _drawn_kind(rng: np.random.Generator, singles: tuple[str, ...], pairs: tuple[str, ...], outside: tuple[str, ...]) -> str:
+    """Draw a kind: a third of the cases have no effect."""
+    if rng.random() < 1 / 3:
+        return "none"
+    share = rng.random()
+    return str(rng.choice(outside if share < OUTSIDE else pairs if share < OUTSIDE + PAIR else singles))
 
 
 def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance: Callable[[int], Any]):
     form = form_of(rng, kind)
     if form is not None:
         return form(rng, kind, ratio, name, advance)
-    plastic = PLASTIC if kind in YIELDING else ELASTIC
+    plastic = PLASTIC if set(kind.split("+")) & set(YIELDING) else ELASTIC
     if kind == "none" and rng.random() < 0.3:
         plastic = PLASTIC
     young = float(f"{math.exp(rng.uniform(math.log(1e5), math.log(1e6))):.3g}")
@@ -86,11 +105,14 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         paths.append((t, np.exp(-reach * amount * swing**2 if kind == "compaction" else reach * amount * swing)))
 
     def stresses(values: Mapping[str, float]) -> list[np.ndarray]:
-        specimen = Specimen(*material(elasticity, plasticity), Effects.of(dict(values)), 1)
+        swing = values.get("swinging_stiffness.a", 0.0)
+        own = {key: value for key, value in values.items() if not key.startswith("swinging_stiffness.")}
+        specimen = Specimen(*material(elasticity, plasticity), Effects.of(own), 1)
         found = []
         for (_, mode, *_), (t, path) in zip(plans, paths):
             given = torch.from_numpy(path)[:, None]
-            found.append(stress_along(specimen, mode, given, time=torch.from_numpy(t))[0, :, 0].numpy())
+            stress = stress_along(specimen, mode, given, time=torch.from_numpy(t))[0, :, 0].numpy()
+            found.append(stress * (1 + swing * np.sin(2 * np.pi * t / (SWING * PERIOD))))
         advance(1)
         if not all(np.isfinite(one).all() for one in found):
             raise Redraw("the stress of the specimen does not converge")
@@ -100,14 +122,14 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     noise = 3e-3 * max(float(np.abs(one).max()) for one in plain)
     flow = plasticity.get("yield_stress", young)
     sizes = _test_sizes(rng, young, flow)
-    drawn = drawn_effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
-    true = stresses(drawn.values) if drawn else plain
+    drawn = drawn_effects(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
+    true = stresses(_values(drawn)) if drawn else plain
     declared = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
     free = ["young", "yield_stress"] if plastic == PLASTIC and rng.random() < 0.5 else ["young"]
     start = {"young": declared} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
     roles, names = [plan[2] for plan in plans], [plan[0] for plan in plans]
     truth = {
-        "undeclared": [truth_entry(drawn, free=tuple(free))] if drawn else [],
+        "undeclared": [_entry(one, tuple(free)) for one in drawn],
         "measured": "material_test",
         "material": {"elasticity": elasticity["law"], "plasticity": plastic,
                      **{k: v for part in (elasticity, plasticity) for k, v in part.items() if k != "law"}},
@@ -127,6 +149,19 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         "free": free,
     }
     return functools.partial(write_tests, name, model, tests), truth
+
+
+def _values(drawn: Sequence[Drawn]) -> dict[str, float]:
+    """Return the parameters of all effects."""
+    return {name: value for one in drawn for name, value in one.values.items()}
+
+
+def _entry(drawn: Drawn, free: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Describe an effect for the key."""
+    if drawn.kind == "swinging_stiffness":
+        meaning = f"stress times 1 + a sin(2 pi t / {SWING * PERIOD:g} s)"
+        return outside_entry(drawn, meaning, {"a": "1"}, ("stiffness_change", "hysteresis", "viscosity_shear", "maxwell"))
+    return truth_entry(drawn, free=free)
 
 
 def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
@@ -156,6 +191,7 @@ def _test_sizes(rng: np.random.Generator, young: float, flow: float) -> Sizes:
         "nonlinear_backstress": ({"h1": 0.3 * young, "g1": 15.0}, "h1", 0.02, 20),
         "cyclic_hardening": ({"q": (-0.2 if rng.random() < 0.5 else 0.3) * flow, "b": 5.0}, "q", 0.02, 3),
         "rate_power": ({"k": 0.2 * flow, "n": rng.uniform(0.2, 0.6)}, "k", 0.02, 20),
+        "swinging_stiffness": ({"a": 0.1}, "a", 0.05, 5),
         "stiffness_change": ({"rate": -0.1 if rng.random() < 0.5 else 0.1}, "rate", 0.05, 3),
     }
 
@@ -171,26 +207,29 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
     gravity = (0.0, -9.81, 0.0)
 
     def paths(values: Mapping[str, float]) -> np.ndarray:
-        own = {key.partition(".")[2]: value for key, value in values.items()}
         acting: dict[str, Any] = {"gravity": np.array(gravity)}
-        if kind == "gravity" and own:
-            acting["gravity"] = np.array(gravity) * (1 + own["g"] / 9.81)
-        elif kind in ("uniform_acceleration", "magnus") and own:
-            acting[kind] = np.array([own[a] for a in "xyz"])
-        elif kind == "position_force" and own:
-            acting |= {"position_force": own["k"], "position_centre": np.array([own[a] for a in "xyz"])}
-        elif own:
-            acting[kind] = own["k"]
+        for name in dict.fromkeys(key.partition(".")[0] for key in values):
+            own = {key.partition(".")[2]: value for key, value in values.items() if key.startswith(f"{name}.")}
+            if name == "gravity":
+                acting["gravity"] = np.array(gravity) * (1 + own["g"] / 9.81)
+            elif name in ("uniform_acceleration", "magnus"):
+                acting[name] = np.array([own[a] for a in "xyz"])
+            elif name == "position_force":
+                acting |= {"position_force": own["k"], "position_centre": np.array([own[a] for a in "xyz"])}
+            elif name == "dry_drag":
+                acting["dry_friction"] = own["c"]
+            else:
+                acting[name] = own["k"]
         advance(1)
         return fly(t, start, velocity, np.zeros(count), Forces(**acting), step=2e-3)
 
     plain = paths({})
     sizes = _track_sizes(rng)
-    drawn = drawn_effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
-    true = paths(drawn.values) if drawn else plain
+    drawn = drawn_effects(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
+    true = paths(_values(drawn)) if drawn else plain
     roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
     truth = {
-        "undeclared": [truth_entry(drawn)] if drawn else [],
+        "undeclared": [_entry(one) for one in drawn],
         "measured": "track",
         "simulated_with": "a point mass, Runge-Kutta steps of 2 ms",
         "noise": noise,
@@ -214,6 +253,7 @@ def _track_sizes(rng: np.random.Generator) -> Sizes:
         "drag_linear": ({"k": 0.2}, "k", 0.02, 10),
         "drag_quadratic": ({"k": 0.05}, "k", 0.02, 10),
         "magnus": (dict(zip("xyz", 0.3 * turn)), "x y z", 0.05, 8),
+        "dry_drag": ({"c": 0.5}, "c", 0.02, 10),
         "position_force": ({"k": 1.0, **dict(zip("xyz", place))}, "k", 0.05, 8),
     }
 

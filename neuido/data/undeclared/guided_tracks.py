@@ -115,6 +115,8 @@ KINDS = {
     "bounce:bounce_friction": "bounce_friction", "bounce:bounce_speed": "bounce_speed", "disc:lift": "lift", "water:buoyancy": "buoyancy",
 }  # fmt: skip
 """The effect of each kind of case, "guide:effect"."""
+PAIRS = {f"{guide}:drag_linear+dry_friction": "drag_linear+dry_friction" for guide in ("pendulum", "spring", "axis")}
+"""The two effects of each kind of case that has two."""
 
 
 def guided_case(
@@ -131,9 +133,9 @@ def guided_case(
     for option in ("solver", "nuisances", "particles", "seconds"):
         if getattr(case, option):
             raise UserError(f"case.{option} = {getattr(case, option)} applies to bodies only: remove it, or give case.measured = body")
-    if case.kind is not None and case.kind not in ("none", *KINDS):
-        raise UserError(f"case.kind = {case.kind!r} does not suit case.measured = guided: choose from none, {', '.join(KINDS)}")
-    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(list(KINDS))))
+    if case.kind is not None and case.kind not in ("none", *KINDS, *PAIRS):
+        raise UserError(f"case.kind = {case.kind!r} does not suit case.measured = guided: choose from none, {', '.join((*KINDS, *PAIRS))}")
+    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(list(KINDS if rng.random() < 0.8 else PAIRS))))
     guide = str(rng.choice([g for g in GUIDES if g not in ("disc", "water")])) if kind == "none" else kind.partition(":")[0]
     made = GUIDES[guide](rng)
     fps = float(rng.choice([60.0, 100.0]))
@@ -153,20 +155,20 @@ def guided_case(
 
     plain = seen({})
     noise = float(f"{rng.uniform(1.0, 3.0) * 1e-3 * (np.ptp(plain) if guide in ('spring', 'axis') else 1.0):.3g}")
-    drawn = None
-    if kind != "none":
-        ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
-        values, size = _sizes(rng, made, KINDS[kind])
-        named = {f"{KINDS[kind]}.{key}": value for key, value in values.items()}
-        drawn = Drawn(kind, named, tuple(f"{KINDS[kind]}.{key}" for key in size.split()), 1e-4, 100.0)
-        drawn = scale_to_separation(drawn, ratio * noise, lambda one: rms((seen(one.values) - plain)[:2]), 16 * noise).rounded()
-    true = seen(drawn.values) if drawn else plain
+    drawn: list[Drawn] = []
+    ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
+    for effect in () if kind == "none" else (KINDS | PAIRS)[kind].split("+"):
+        values, size = _sizes(rng, made, effect)
+        named = {f"{effect}.{key}": value for key, value in values.items()}
+        one = Drawn(effect, named, tuple(f"{effect}.{key}" for key in size.split()), 1e-4, 100.0)
+        drawn.append(scale_to_separation(one, ratio * noise, lambda own: rms((seen(own.values) - plain)[:2]), 16 * noise).rounded())
+    true = seen({name: value for one in drawn for name, value in one.values.items()}) if drawn else plain
     roles, names = ("fit", "fit", "held_out"), ("run-1", "run-2", "run-3")
     rows = [
         {"name": n, "role": r, "separation_over_noise": rounded_to_4(rms(a - b) / noise)} for n, r, a, b in zip(names, roles, true, plain)
     ]
     truth = {
-        "undeclared": [_entry(drawn, KINDS[kind])] if drawn else [],
+        "undeclared": [_entry(one) for one in drawn],
         "measured": "guided",
         "guide": guide,
         "simulated_with": f"a point mass, Runge-Kutta steps of {STEP:g} s",
@@ -224,15 +226,15 @@ def _forces(values: Mapping[str, float], made: Guided) -> dict[str, Any]:
     return out
 
 
-def _entry(drawn: Drawn, effect: str) -> dict[str, Any]:
+def _entry(drawn: Drawn) -> dict[str, Any]:
     """Describe an effect for the list `undeclared` of the key of a case."""
-    entry = next(one for one in LIBRARY if one.name == effect)
+    entry = next(one for one in LIBRARY if one.name == drawn.kind)
     units = {p.name: p.unit for p in entry.parameters}
     values = {key.partition(".")[2]: value for key, value in drawn.values.items()}
     alike = {"buoyancy": ["gravity", "uniform_acceleration", "added_mass"]}
     return {
-        "kind": effect,
-        "diagnosis_names": [effect, *alike.get(effect, [])],
+        "kind": drawn.kind,
+        "diagnosis_names": [drawn.kind, *alike.get(drawn.kind, [])],
         "parameters": values,
         "sizes": [key.partition(".")[2] for key in drawn.sizes],
         "units": {key: units[key] for key in values},

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from neuido.data.measured.experiment import Recording as Measured
+from neuido.data.measured.material_test import CURVES, MaterialTest
 from neuido.discrepancy.inference.search.attribution import Diagnosis
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.errors import UserError
@@ -297,12 +298,41 @@ class _Loads(Problem):
         return out.reshape(len(points), -1).numpy()
 
 
+class _Curve(Problem):
+    """Another curve of the same material, which begins anew."""
+
+    def __init__(self, problem: Problem, test: MaterialTest) -> None:
+        super().__init__("", "rmse", "1", (), (), (), ())
+        self.inner, self.test = problem, test
+
+    def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
+        return self.inner.along(points, [self.test])
+
+
+def _curves(problem: Problem, tests: Sequence[MaterialTest]) -> Iterator[tuple[str, Problem, Any]]:
+    """Yield curves at lower and at higher rates or frequencies, and rates that are held longer, as `_materials`."""
+    test = tests[0]
+    what = "shear rates" if test.mode == "flow_curve" else "frequencies"
+    noise = max([r.noise or 0.0 for r in problem.recordings]) or 0.01  # of logarithms
+    changes = [(f"{what} ten times as low", 0.1, 1.0), (f"{what} ten times as high", 10.0, 1.0)]
+    if test.time is not None:
+        changes += [(f"the same {what}, each held ten times as long", 1.0, 10.0), (f"the same {what}, ten times as fast through", 1.0, 0.1)]
+    for name, factor, longer in changes:
+        time = None if test.time is None else longer * test.time
+        other = replace(test, path=factor * test.path, time=time)
+        yield name, _Curve(problem, other), lambda rows: np.full(rows.shape[1], noise)
+
+
 def _materials(problem: Problem) -> Iterator[tuple[str, Problem, Any]]:
     """Yield material tests: name, problem, and function from predictions to their standard deviations (n,).
 
-    They are of all modes, up to the measured stretch and beyond it, with and without the way back.
+    They are of all modes, up to the measured stretch and beyond it, with and without the way back. Flow curves and small oscillations are
+    of other rates and frequencies.
     """
     tests = [t for t in problem.tests.tests if t.role == "fit"]
+    if tests[0].mode in CURVES:
+        yield from _curves(problem, tests)
+        return
     largest = max(float(np.abs(t.path if t.mode == "simple_shear" else np.log(t.path)).max()) for t in tests)
     timed = all(t.time is not None for t in tests)
     duration = max(float(np.ptp(t.time)) for t in tests) if timed else 0.0

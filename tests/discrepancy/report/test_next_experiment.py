@@ -8,6 +8,7 @@ import torch
 
 from neuido.data.measured.experiment import read_experiment
 from neuido.data.measured.track import read_tracks
+from neuido.data.undeclared import Case, make_undeclared
 from neuido.discrepancy.inference import floors
 from neuido.discrepancy.inference.floors import Floor, Round, Stand, Trial
 from neuido.discrepancy.inference.least_squares import Fit
@@ -138,3 +139,27 @@ def test_material_tests(tmp_path):
     found = next_experiment.propose(d)
     assert set(found["tells_apart"]) == {"strain_stiffening", "second_invariant"}
     assert "stretch" in found["change"] or "shear" in found["change"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rival", "word"),
+    [
+        ("bingham", {"power_law": {"power_law.n": -0.4, "power_law.reference": 1.0}}, "shear rates"),
+        ("thixotropy", {"power_law": {"power_law.n": -0.3, "power_law.reference": 1.0}}, "shear rates"),
+        ("hysteresis", {"viscosity_shear": {"viscosity_shear.eta": 100.0}}, "frequencies"),
+    ],
+)
+def test_curves_of_a_rheometer_are_told_apart_at_other_rates(tmp_path, kind, rival, word):
+    """A fluid has no elasticity, so that a stretch of it cannot be proposed."""
+    from neuido.data.measured.material_test import read_material_tests
+    from neuido.discrepancy.problems.specimens.material import MaterialProblem
+
+    for seed in range(20):
+        make_undeclared(seed, tmp_path / str(seed), case=Case(measured="material_test", kind=kind), device="cpu", progress=False)
+        if read_material_tests(tmp_path / str(seed)).tests[0].mode in ("flow_curve", "oscillation"):
+            break
+    problem = MaterialProblem(tmp_path / str(seed))
+    start = next(c for c in problem.candidates if c.name == kind).starts[-1]
+    found = next_experiment.propose(diagnosis(problem, {kind: dict(start), **rival}))
+    assert set(found["tells_apart"]) == {kind, *rival}
+    assert word in found["change"] and found["expected_log_odds"] > 0

@@ -76,13 +76,13 @@ class MaterialProblem(Problem):
         chain = next(chain for chain in self._chains if recording in chain)
         tests = [self.tests.tests[i] for i in chain[: chain.index(recording) + 1]]
         try:
-            return self._along(points, tests)
+            return self.along(points, tests)
         except UserError:  # one parameter set that the law refuses fails the whole batch
             if len(points) == 1:
                 return np.full((1, n), np.nan)
             return np.concatenate([self.predict([point], recording) for point in points])
 
-    def _along(self, points: Sequence[Point], tests: Sequence[MaterialTest]) -> np.ndarray:
+    def along(self, points: Sequence[Point], tests: Sequence[MaterialTest]) -> np.ndarray:
         """Return what the last of several tests of one specimen measures, for each parameter set."""
         last, rows = tests[-1], sum(len(test.path) for test in tests[:-1])
         path = np.concatenate([test.path for test in tests])
