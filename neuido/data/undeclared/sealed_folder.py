@@ -16,7 +16,7 @@ from neuido.data.files.writing import made_folder, new_folder, remove, write_tex
 from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.curves import curve_case
+from neuido.data.undeclared.curves import TEST_OUTSIDE, curve_case
 from neuido.data.undeclared.guided_tracks import guided_case
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
@@ -86,7 +86,8 @@ def _check(case: Case) -> None:
     if case.solver is not None and case.solver not in SOLVERS:
         raise UserError(f"solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
     if case.kind is not None and case.kind != "none" and case.measured != "guided":
-        known = (*KINDS, *OUTSIDE, *(entry.name for entry in POINT_ENTRIES if case.measured == "material_test"))
+        tests = (*(entry.name for entry in POINT_ENTRIES), *TEST_OUTSIDE) if case.measured == "material_test" else ()
+        known = (*KINDS, *OUTSIDE, *tests)
         for kind in case.kind.split("+"):
             if kind not in known:
                 raise UserError(f"kind = {kind!r} is unknown: choose from none, {', '.join(known)}, or join two by +")

@@ -13,6 +13,7 @@ from neuido.discrepancy.inference.search.intervals import would_help
 from neuido.discrepancy.inference.search.judging import ALPHA
 from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT
+from neuido.discrepancy.problems.tracks.scale_error import rival_scale
 from neuido.discrepancy.report import ceiling, next_experiment, residual
 from neuido.discrepancy.report.reader_units import reach
 from neuido.discrepancy.report.wording import title
@@ -93,6 +94,8 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         content["doubts"] = doubtful
     if "unseen" in d.problem.labels:
         content["unseen"] = d.problem.labels["unseen"]
+    if content["effects"] and (scale := rival_scale(d.problem, d.before, d.after)) is not None:
+        content["scale_error"] = scale
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
     drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}

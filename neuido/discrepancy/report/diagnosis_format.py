@@ -153,6 +153,7 @@ def schema() -> Schema:
             "not_predicted": mapping(ANY_TEXT),
             "doubts": mapping(listing(TEXT)),
             "unseen": TEXT,
+            "scale_error": {"type": "array", "items": NUMBER},
             "silhouettes": {"type": "object"},
         },
     )

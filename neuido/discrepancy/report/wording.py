@@ -342,6 +342,11 @@ def _sure(c: Content) -> str:
             out.append(
                 f"{title(e['name']).capitalize()}: {sentence[0].lower()}{sentence[1:]}." if len(c["effects"]) > 1 else f"{sentence}."
             )
+    if c.get("scale_error"):
+        first, last = (f"{100 * abs(x):.2g}" for x in c["scale_error"])
+        amount = first if first == last else f"{first} to {last}"
+        longer = "long" if c["scale_error"][0] > 0 else "short"
+        out.append(f"A scale error would explain it as well, lengths measured {amount} % too {longer}: measure a known length.")
     return " ".join(out)
 
 

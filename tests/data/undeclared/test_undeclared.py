@@ -297,3 +297,22 @@ def test_curves(tmp_path, measured, kind, read):
     assert content["undeclared"][0]["kind"] == kind.rpartition(":")[2] and read(tmp_path / "c").name == "c"
     rows = content.get("tests", content.get("recordings"))
     assert rows[0]["separation_over_noise"] > 15
+
+
+@pytest.mark.parametrize(
+    ("measured", "kind", "outside"),
+    [
+        ("material_test", "maxwell+strain_stiffening", False), ("track", "drag_quadratic+magnus", False),
+        ("guided", "pendulum:drag_linear+dry_friction", False), ("material_test", "swinging_stiffness", True), ("track", "dry_drag", True),
+    ],
+)  # fmt: skip
+def test_curves_have_pairs_and_effects_outside_the_library(tmp_path, measured, kind, outside):
+    """Each effect of a pair is as large as one alone, and an effect outside the library is named like none in it."""
+    key = yaml.safe_load(
+        make_undeclared(1, tmp_path / "a", case=Case(measured=measured, kind=kind), device="cpu", progress=False).read_text()
+    )
+    assert [one["kind"] for one in key["undeclared"]] == kind.rpartition(":")[2].split("+")
+    assert [one["outside_library"] for one in key["undeclared"]] == [outside] * len(key["undeclared"])
+    assert all(not set(one["diagnosis_names"]) & {entry.name for entry in LIBRARY} for one in key["undeclared"] if outside)
+    rows = key.get("recordings") or key["tests"]
+    assert rows[0]["separation_over_noise"] > 8

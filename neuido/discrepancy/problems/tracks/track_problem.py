@@ -1,5 +1,6 @@
 """Tracks as `Problem`s, one per body: a point mass that flies or is guided, measured with errors of clock and length scale."""
 
+import copy
 import math
 import os
 from collections.abc import Sequence
@@ -124,6 +125,13 @@ class TrackProblem(Problem):
         if not any(name == "length_scale" for name in start.names) or track.role == "held_out":
             return super().instrument_errors(point, recording)
         return scale_gradient(start, self.forces([point], track)).reshape(-1, 1)
+
+    def with_scale_error(self, sd: float) -> "TrackProblem":
+        """Return this problem with another standard deviation of the length scale; noise and candidates stay as they are."""
+        other = copy.copy(self)
+        other.tracks = replace(self.tracks, nuisances={**self.tracks.nuisances, "length_scale": sd})
+        other._starts = [other._released(track, {c.name for c in self.candidates}) for track in self._flights]
+        return other
 
     def predict(self, points: Sequence[Point], recording: int, setting: int = 0) -> np.ndarray:
         if not points:

@@ -1,0 +1,38 @@
+"""An error of the length scale as a rival of the effects that a track is said to lack."""
+
+import json
+
+import numpy as np
+import pytest
+
+import neuido
+from tests.discrepancy import made
+
+SAID = "A scale error would explain it as well"
+
+
+def diagnosed(folder, *, drag, scale, effects):
+    made.track(folder, drag=drag)
+    for file in folder.glob("*.csv"):
+        rows = np.loadtxt(file, delimiter=",", skiprows=1)
+        rows[:, 1:] *= scale
+        np.savetxt(file, rows, delimiter=",", header="t,x,y", comments="")
+    out = folder.with_name("answer")
+    neuido.diagnose(folder, out=out, effects=effects, device="cpu")
+    content = json.loads((out / "diagnosis.json").read_text())
+    return content.get("bodies", [content])[0]
+
+
+@pytest.mark.parametrize("scale", [0.96, 1.04])
+def test_a_gravity_that_a_wrong_ruler_makes_says_so(tmp_path, scale):
+    found = diagnosed(tmp_path / "balls", drag=0.0, scale=scale, effects=["gravity", "drag_quadratic"])
+    assert [e["name"] for e in found["effects"]] == ["gravity"]
+    assert found["scale_error"] == pytest.approx([scale - 1] * 2, abs=0.004)
+    words = next(line for line in found["words"] if SAID in line)
+    assert f"% too {'long' if scale > 1 else 'short'}: measure a known length" in words
+
+
+def test_a_drag_that_no_scale_imitates_does_not(tmp_path):
+    found = diagnosed(tmp_path / "balls", drag=0.12, scale=1.0, effects=["gravity", "drag_quadratic"])
+    assert [e["name"] for e in found["effects"]] == ["drag_quadratic"]
+    assert "scale_error" not in found and not any(SAID in line for line in found["words"])
