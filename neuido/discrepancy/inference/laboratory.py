@@ -215,7 +215,8 @@ class Laboratory:
             options: Further options of `levenberg_marquardt`.
         """
         margin = functools.partial(self.problem.margin, setting=self.setting)
-        together = self.problem.together
+        # slopes are carried where motions are simulated, on a GPU too: there as well, other fits and lanes wait for what a launch does
+        together = self.problem.together and self.problem.settings == 1
         return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.budget.ends(until), **options)
 
     def runs(self, point: Point) -> bool:
