@@ -25,6 +25,11 @@ def rubber(c: Constants) -> bool:
     )  # fmt: skip
 
 
+def relaxes(c: Constants) -> bool:
+    """Return whether a card has a Prony series: neither program takes one beside plasticity."""
+    return bool(c.prony) and not c.yields and c.friction_angle is None
+
+
 def polynomial(c: Constants) -> tuple[float, float, float, float]:
     """Return C10, C01, C20 and C30 [Pa] of the expansion in I1bar - 3 and I2bar - 3.
 
@@ -63,25 +68,26 @@ def remarks(c: Constants, program: str) -> list[str]:
 def abaqus_card(c: Constants, name: str, units: Units) -> tuple[list[str], list[str]]:
     """Return the lines of a card and its remarks."""
     s, notes = units.stress, remarks(c, "abaqus")
+    term = ", MODULI=LONG TERM" if relaxes(c) else ""
     out = [f"*MATERIAL, NAME={name}", "*DENSITY", figures(c.density * units.density)]
     if rubber(c):
         C10, C01, C20, C30 = (s * value for value in polynomial(c))
         D = 0.0 if c.incompressible else 2 / (s * c.bulk)
         if C01 and C20:
-            out += ["*HYPERELASTIC, POLYNOMIAL, N=3, MODULI=LONG TERM", figures(C10, C01, C20, 0, 0, C30, 0, 0), figures(0, D, 0, 0)]
+            out += [f"*HYPERELASTIC, POLYNOMIAL, N=3{term}", figures(C10, C01, C20, 0, 0, C30, 0, 0), figures(0, D, 0, 0)]
         elif C01:
-            out += ["*HYPERELASTIC, MOONEY-RIVLIN, MODULI=LONG TERM", figures(C10, C01, D)]
+            out += [f"*HYPERELASTIC, MOONEY-RIVLIN{term}", figures(C10, C01, D)]
         elif C20:
-            out += ["*HYPERELASTIC, YEOH, MODULI=LONG TERM", figures(C10, C20, C30, D, 0, 0)]
+            out += [f"*HYPERELASTIC, YEOH{term}", figures(C10, C20, C30, D, 0, 0)]
         else:
-            out += ["*HYPERELASTIC, NEO HOOKE, MODULI=LONG TERM", figures(C10, D)]
+            out += [f"*HYPERELASTIC, NEO HOOKE{term}", figures(C10, D)]
     else:
-        out += ["*ELASTIC, TYPE=ISOTROPIC, MODULI=LONG TERM", figures(s * c.young, c.poisson)]
-    if c.prony and (c.yields or c.friction_angle is not None):
-        notes.append("DOES NOT MAP and is left out: the relaxation, since Abaqus takes no Prony series beside plasticity")
-    elif c.prony:
+        out += [f"*ELASTIC, TYPE=ISOTROPIC{term}", figures(s * c.young, c.poisson)]
+    if relaxes(c):
         total = 1 + sum(g for g, _ in c.prony)
         out += ["*VISCOELASTIC, TIME=PRONY", *(figures(g / total, 0, T) for g, T in c.prony)]
+    elif c.prony:
+        notes.append("DOES NOT MAP and is left out: the relaxation, since Abaqus takes no Prony series beside plasticity")
     if c.yields:
         out += _abaqus_plasticity(c, s, notes)
     if c.friction_angle is not None:
@@ -129,10 +135,9 @@ def ansys_card(c: Constants, name: str, units: Units) -> tuple[list[str], list[s
     """Return the lines of a card and its remarks."""
     s, notes = units.stress, remarks(c, "ansys")
     out = ["MAT_ID = 1", f"MP,DENS,MAT_ID,{figures(c.density * units.density)}"]
-    flows = c.yields or c.friction_angle is not None
-    if c.prony and flows:
+    if c.prony and not relaxes(c):
         notes.append("DOES NOT MAP and is left out: the relaxation, since Ansys takes no Prony series beside plasticity")
-    prony = [] if flows else c.prony
+    prony = c.prony if relaxes(c) else []
     factor = 1 + sum(g for g, _ in prony)
     if rubber(c):
         C10, C01, C20, C30 = (s * factor * value for value in polynomial(c))
