@@ -89,7 +89,7 @@ class Body(_BodyFields):
         spin: Angular velocity about the centre of volume [rad/s], added to `velocity` or `v`.
 
     Raises:
-        TypeError: Neither particles nor a shape.
+        TypeError: Neither particles nor a shape, or a value of a wrong kind.
     """
 
     def __new__(
@@ -113,12 +113,15 @@ class Body(_BodyFields):
         given = {"x": x, "v": v, "volume": volume, "F": F, "name": name or None, "law": law, "plasticity": plasticity}
         given |= {"density": density, "fields": fields, "skin": skin}
         if shape is not None:
+            if not isinstance(shape, Body):
+                raise TypeError(f"shape of a body is {shape!r}; give one of neuido.shapes, such as shapes.ball(...), or another body")
             given = {key: getattr(shape, key) if value is None else value for key, value in given.items()}
         given["name"] = given["name"] or ""
         if given["x"] is None or given["volume"] is None:
             raise TypeError(f"body {name!r} has no particles; give `shape`, or `x` and `volume`")
         if velocity is not None or given["v"] is None:
-            given["v"] = torch.zeros_like(given["x"]) + torch.tensor(velocity or (0.0, 0.0, 0.0)).to(given["x"])
+            start = (0.0, 0.0, 0.0) if velocity is None else velocity
+            given["v"] = torch.zeros_like(given["x"]) + three_numbers(start, "velocity of a body").to(given["x"])
         if spin is not None:
             given["v"] = given["v"] + _turning(given["x"], given["volume"], spin)
         return super().__new__(cls, **given)
@@ -130,7 +133,22 @@ class Body(_BodyFields):
 def _turning(x: Tensor, volume: Tensor, spin: Vector) -> Tensor:
     """Return the velocity [m/s], (P, 3), of a rotation about the centre of volume."""
     r = x - (volume[:, None] * x).sum(0) / volume.sum()
-    return torch.linalg.cross(torch.tensor(spin).to(r).expand_as(r), r)
+    return torch.linalg.cross(three_numbers(spin, "spin of a body").to(r).expand_as(r), r)
+
+
+def three_numbers(given: Any, what: str) -> Tensor:
+    """Return a vector as a tensor, (3,).
+
+    Raises:
+        TypeError: It is something else.
+    """
+    try:
+        out = torch.as_tensor(given)
+    except (TypeError, ValueError, RuntimeError):
+        out = torch.empty(0)
+    if out.shape != (3,):
+        raise TypeError(f"{what} is {given!r}; give three numbers")
+    return out
 
 
 class Skin(NamedTuple):

@@ -23,11 +23,11 @@ OWN: dict[str, tuple[type[Solid], tuple[str, ...], tuple[str, ...]]] = {
 """Each kind of solid in a file: its class, and the keys that it needs and may have besides `SHARED`."""
 
 
-def mesh_collider(path: str | os.PathLike, *, scale: float | None = None, up: str | None = None, **options: Any) -> MeshCollider:
+def mesh_collider(file: str | os.PathLike, *, scale: float | None = None, up: str | None = None, **options: Any) -> MeshCollider:
     """Read a collider from a mesh file; it must be watertight.
 
     Args:
-        path: An .obj, .stl, .ply, .glb or USD file.
+        file: An .obj, .stl, .ply, .glb or USD file.
         scale: Metres per unit of the file; by default what a USD file says, else 1.
         up: The axis of the file that points up: x, y or z; by default what a USD file says, else y.
         options: Position, rotation, contact, friction, motion, mass and name, as for every solid.
@@ -35,11 +35,11 @@ def mesh_collider(path: str | os.PathLike, *, scale: float | None = None, up: st
     Raises:
         UserError: The file cannot be read, the mesh is not watertight, or an option is impossible.
     """
-    mesh = read_mesh(path, scale=scale, up=up)
+    mesh = read_mesh(file, scale=scale, up=up)
     try:
         return MeshCollider(mesh.vertices, mesh.faces, **options)
     except UserError as error:
-        raise UserError(f"{path}: {error}") from error
+        raise UserError(f"{file}: {error}") from error
 
 
 def solid_from_dict(given: Mapping[str, Any], where: str, find: Callable[[str, str], Any] | None) -> Solid:

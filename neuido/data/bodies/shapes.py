@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
@@ -256,8 +256,8 @@ def _lattice(lower: Sequence[float], upper: Sequence[float], spacing: float, jit
 
 
 def _vector(name: str, value: Sequence[float]) -> Vector:
-    if len(value) != 3 or not all(math.isfinite(c) for c in value):
-        raise UserError(f"{name} must be three finite numbers, got {list(value)}")
+    if not isinstance(value, Iterable) or len(value := tuple(value)) != 3 or not all(math.isfinite(c) for c in value):
+        raise UserError(f"{name} must be three finite numbers, got {value!r}")
     return tuple(float(c) for c in value)  # type: ignore[return-value]
 
 

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from neuido.errors import UserError
-from neuido.types import Solid, Vector
+from neuido.types import Keyframes, Solid, Vector
 
 HALF_SPACE, SPHERE, CUBOID, CAPSULE, CYLINDER, HEIGHT_FIELD, MESH = range(1, 8)
 """Number of each kind of solid in the tables of the kernels; 0 means an unused row."""
 RIM_POINTS = 12
 """Points on each rim of a cylinder at which a free cylinder touches planes; the sagitta of their polygon is 3.4 % of the radius."""
+FIELDS = {"position": 3, "velocity": 3, "spin": 3, "rotation": 4, "restitution": 0}
+"""Number of numbers in fields of all solids; 0: one by itself."""
 HULL_POINTS = 64
 """Most vertices of a free mesh at which it touches planes; of more, those furthest out along as many even directions are taken."""
 
@@ -54,7 +56,7 @@ class Cuboid(Solid):
     size: Vector
 
     def __post_init__(self) -> None:
-        _check(self, **dict(zip(("size[0]", "size[1]", "size[2]"), self.size, strict=True)))
+        _check(self, **_edges(self, 3))
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class HeightField(Solid):
     size: tuple[float, float]
 
     def __post_init__(self) -> None:
-        _check(self, **dict(zip(("size[0]", "size[1]"), self.size, strict=True)))
+        _check(self, **_edges(self, 2))
         heights = array(self.heights, "heights of a HeightField")
         if heights.ndim != 2 or min(heights.shape) < 2:
             raise UserError(f"heights of a HeightField has shape {heights.shape}; give (nx, nz), at least 2 x 2")
@@ -154,23 +156,44 @@ def array(given: Any, what: str) -> np.ndarray:
     return out
 
 
+def _edges(solid: "Cuboid | HeightField", count: int) -> dict[str, float]:
+    """Return the lengths of a solid, each with its name."""
+    return {f"size[{i}]": side for i, side in enumerate(_numbers(solid, "size", count).tolist())}
+
+
+def _numbers(solid: Solid, name: str, count: int) -> np.ndarray:
+    """Return a field of `count` numbers; 0: one number by itself.
+
+    Raises:
+        UserError: It is something else.
+    """
+    what, value = f"{name} of a {type(solid).__name__}", getattr(solid, name)
+    out = array(value, what)
+    if out.shape != ((count,) if count else ()):
+        raise UserError(f"{what} is {value!r}; give {f'{count} numbers' if count else 'one number'}")
+    return out
+
+
 def _check(solid: Solid, **lengths: float) -> None:
     """Validate what all solids share, and that the given lengths are positive."""
     kind = type(solid).__name__
+    for name, count in FIELDS.items():
+        _numbers(solid, name, count)
     for name, value in lengths.items():
-        if not (value > 0 and math.isfinite(value)):
+        if not array(value, f"{name} of a {kind}") > 0:
             raise UserError(f"{name} of a {kind} is {value}; give a positive length [m]")
+    if solid.path is not None and not isinstance(solid.path, Keyframes):
+        raise UserError(f"path of a {kind} is a {type(solid.path).__name__}; give neuido.Keyframes(times, positions)")
     if solid.contact not in ("sticky", "slip", "separate"):
         raise UserError(f"contact of a {kind} is {solid.contact!r}; choose one of sticky, slip, separate")
-    if not solid.friction >= 0.0:
-        raise UserError(f"friction of a {kind} is {solid.friction}; give zero or more")
+    if not (isinstance(solid.friction, (int, float, np.number)) and solid.friction >= 0.0):
+        raise UserError(f"friction of a {kind} is {solid.friction!r}; give zero or more")
     if not 0.0 <= solid.restitution <= 1.0:
         raise UserError(f"restitution of a {kind} is {solid.restitution}; give a share from 0 to 1")
-    size = math.hypot(*solid.rotation)
-    if len(solid.rotation) != 4 or not (size > 0 and math.isfinite(size)):
+    if not any(solid.rotation):
         raise UserError(f"rotation of a {kind} is {list(solid.rotation)}; give a quaternion (w, x, y, z) that is not zero")
     if solid.mass is not None:
-        if not (solid.mass > 0 and math.isfinite(solid.mass)):
+        if not _numbers(solid, "mass", 0) > 0:
             raise UserError(f"mass of a {kind} is {solid.mass}; give a positive mass [kg], or none for a collider that is not free")
         if solid.path is not None:
             raise UserError(f"a {kind} has a path and a mass; a free body takes its motion from forces: leave one of both out")

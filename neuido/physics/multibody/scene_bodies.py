@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuido.errors import UserError
-from neuido.types import Body, Scene
+from neuido.types import Body, Scene, three_numbers
 
 CONTACTS = ("sticky", "separate")
 """Kinds of contact between bodies."""
@@ -46,6 +46,8 @@ def bodies_of(scenes: Sequence[Scene], given: Body | Sequence[Body] | None, dens
     densities = [float(density)] * count if isinstance(density, (int, float)) else [float(d) for d in density]
     if len(densities) != count or not all(d > 0 for d in densities):
         raise UserError(f"density is {density}; give one positive number, or one for each of {count} scenes")
+    for s, scene in enumerate(scenes):
+        _check_scene(scene, s)
     own = given is None
     if own:
         for s, scene in enumerate(scenes):
@@ -69,6 +71,22 @@ def bodies_of(scenes: Sequence[Scene], given: Body | Sequence[Body] | None, dens
         own_density = tuple(_density(body, rho, _where(body, s, b, own)) for b, body in enumerate(bodies))
         out.append(SceneBodies(bodies, own_density, own, scene.contact == "separate" and len(bodies) > 1))
     return tuple(out)
+
+
+def _check_scene(scene: Scene, number: int) -> None:
+    """Refuse fields of a wrong kind, which would fail without a name further on."""
+    for name in ("lower", "upper", "gravity"):
+        try:
+            three_numbers(getattr(scene, name), f"{name} of scene {number}")
+        except TypeError as error:
+            raise UserError(str(error)) from error
+    for name, kind in (("bodies", "neuido.Body"), ("colliders", "neuido.colliders or Plane"), ("attachments", "neuido.Attachment")):
+        given = getattr(scene, name)
+        if not isinstance(given, (list, tuple)) or isinstance(given, Body):
+            raise UserError(f"{name} of scene {number} is a {type(given).__name__}; give a list, each from {kind}")
+    for b, body in enumerate(scene.bodies):
+        if not isinstance(body, Body):
+            raise UserError(f"bodies[{b}] of scene {number} is a {type(body).__name__}; give a neuido.Body")
 
 
 def _where(body: Body, scene: int, number: int, own: bool) -> str:

@@ -82,6 +82,22 @@ def test_each_kind_is_read_and_the_schema_agrees(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ENTRIES)
+def test_each_kind_takes_each_motion(kind, tmp_path):
+    write_cube(tmp_path / "cube.stl")
+    plain = {key: value for key, value in ENTRIES[kind].items() if key not in ("path", "mass", "velocity", "spin")}
+    motions = [{"path": {"times": [0, 1], "positions": [[0, 0, 0], [0, 1, 0]]}}, {"velocity": [1, 0, 0], "spin": [0, 0, 1]}]
+    motions += [{"mass": 2.0}] * (kind not in ("half_space", "height_field"))
+    for motion in motions if kind != "plane" else ():
+        assert agreed(scene_file(tmp_path, [plain | motion]))
+
+
+def test_a_mesh_collider_follows_a_path(tmp_path):
+    write_cube(tmp_path / "cube.stl")
+    path = Keyframes((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    assert mesh_collider(tmp_path / "cube.stl", path=path).path == path
+
+
+@pytest.mark.parametrize("kind", ENTRIES)
 def test_schema_and_reader_refuse_the_same(kind, tmp_path):
     write_cube(tmp_path / "cube.stl")
     entry = ENTRIES[kind]

@@ -164,3 +164,21 @@ def test_bodies_that_do_not_fit_are_refused(bodies, match):
         Simulator(Scene(bodies=[left()]), left(), device="cpu")
     with pytest.raises(TypeError, match="body 'ghost' has no particles"):
         Body(name="ghost")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda body: Scene(bodies=[{"shape": "ball"}]), r"bodies\[0\] of scene 0 is a dict; give a neuido.Body"),
+        (lambda body: Scene(bodies=body), "bodies of scene 0 is a Body; give a list"),
+        (lambda body: Scene(bodies=[shapes.ball(centre=0.5, radius=0.1, spacing=0.04)]), "centre must be three finite numbers, got 0.5"),
+        (lambda body: Scene(bodies=[body], colliders=3), "colliders of scene 0 is a int; give a list"),
+        (lambda body: Scene(bodies=[body], gravity=-9.8), "gravity of scene 0 is -9.8; give three numbers"),
+        (lambda body: Scene(bodies=[Body(shape=body, velocity=(1.0, 2.0))]), "velocity of a body .* give three numbers"),
+        (lambda body: Scene(bodies=[Body(shape=body, spin=3.0)]), "spin of a body is 3.0; give three numbers"),
+        (lambda body: Scene(bodies=[Body(shape="ball")]), "shape of a body is 'ball'; give one of neuido.shapes"),
+    ],
+)  # fmt: skip
+def test_values_of_a_wrong_kind_are_one_line(make, message):
+    with pytest.raises((UserError, TypeError), match=message):
+        Simulator(make(shapes.cube(length=0.2, centre=(0.5, 0.5, 0.5), particles_per_side=4)), device="cpu")
