@@ -20,6 +20,7 @@ from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Identit
 from neuido.physics.laws.hyperelastic import Fluid, Hyperfoam, MooneyRivlin
 from neuido.physics.laws.parametric import lame
 from neuido.physics.laws.resets import Snow, VolumetricReset
+from neuido.physics.linalg.decompositions import polar
 from neuido.types import Particles
 
 PARAMETERS = {
@@ -164,3 +165,26 @@ def evaluate(law: ElasticLaw | PlasticLaw, F: Tensor) -> Tensor:
     out = torch.empty_like(flat)
     law.forward(law.tensors(), flat, out, everywhere)
     return out.float().reshape(F.shape)
+
+
+def sample_laws(elastic: ElasticLaw, plastic: PlasticLaw, F: Tensor, C: Tensor, dt: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample the laws of one material at the trial gradients of a substep: trial and corrected F, and Kirchhoff stress [Pa].
+
+    The laws are evaluated in float64 at the trial gradients in float32, so the targets are exact for what is stored. The correction of a
+    fluid keeps the rotation of the trial gradient here, which its stress does not feel: so it is frame-indifferent, as those of the other
+    families are.
+
+    Args:
+        elastic, plastic: The laws.
+        F: Deformation gradients before the substep, (..., 3, 3).
+        C: Velocity gradients in it [1/s], (..., 3, 3).
+        dt: The substep [s].
+
+    Returns:
+        Three tensors of the shape of F, float32.
+    """
+    trial = (F.double() + dt * C.double() @ F.double()).float()
+    corrected = evaluate(plastic, trial)
+    if isinstance(plastic, VolumetricReset):
+        corrected = (polar(trial.double())[0] @ corrected.double()).float()
+    return trial, corrected, evaluate(elastic, corrected)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, effects, evaluate, laws
+from neuido.data.bodies.families import PARAMETERS, PUBLISHED, check_ranges, draw_parameters, effects, laws, sample_laws
 from neuido.data.bodies.shapes import cube
 from neuido.data.files.output_folder import claimed_folder
 from neuido.data.files.writing import atomic_write, is_as_written, sha256_of, write_json
@@ -23,8 +23,6 @@ from neuido.data.trajectories.trajectory_files import COLUMNS, FORMAT, is_comple
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw
-from neuido.physics.laws.resets import VolumetricReset
-from neuido.physics.linalg.decompositions import polar
 from neuido.physics.mpm.simulator import Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.physics.runtime.events import OUTSIDE, Event
@@ -251,17 +249,11 @@ def _merge(noted: dict[tuple[int, str], Event], event: Event, start: int, dt: fl
 def _samples(setup: Setup, F: Tensor, C: Tensor, elastic: ElasticLaw, plastic: PlasticLaw) -> Tensor:
     """Compute the recorded columns (T, P, 27) from the frames F, C (K, P, 3, 3) of a rollout.
 
-    The targets are the laws evaluated in float64 at the stored float32 inputs, so they are exact for these inputs. The F of the rollout
-    itself differs by rounding. The correction of a fluid keeps the rotation of the trial gradient here, which its stress does not feel:
-    so it is frame-indifferent, as those of the other families are.
+    The targets are exact for the stored inputs, from which the F of the rollout itself differs by rounding.
     """
     last = torch.arange(setup.record_every, len(F), setup.record_every, device=F.device)
-    trial = (F[last - 1].double() + setup.dt * C[last].double() @ F[last - 1].double()).float()
-    corrected = evaluate(plastic, trial)
-    if isinstance(plastic, VolumetricReset):
-        corrected = (polar(trial.double())[0] @ corrected.double()).float()
-    stress = evaluate(elastic, corrected)
-    return torch.cat([part.flatten(-2) for part in (trial, corrected, stress)], dim=-1)
+    sampled = sample_laws(elastic, plastic, F[last - 1], C[last], setup.dt)
+    return torch.cat([part.flatten(-2) for part in sampled], dim=-1)
 
 
 def _instance(setup: Setup, family: str, number: int, split: str) -> Instance:

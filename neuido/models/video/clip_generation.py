@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, effects, evaluate, laws
+from neuido.data.bodies.families import PARAMETERS, check_ranges, draw_parameters, effects, laws, sample_laws
 from neuido.data.bodies.shapes import rigid_velocity
 from neuido.data.cameras import intrinsics, look_at
 from neuido.data.clips import FORMAT, is_complete
@@ -28,8 +28,6 @@ from neuido.models.render.gaussians import deform, harmonics_of
 from neuido.models.render.splatting import render
 from neuido.models.video.clip_bodies import GROUPS, frame_steps, launch, random_body, random_shape
 from neuido.models.video.flow import PRESETS, measure_velocities
-from neuido.physics.laws.resets import VolumetricReset
-from neuido.physics.linalg.decompositions import polar
 from neuido.physics.mpm.simulator import COURANT_LIMIT, Simulator
 from neuido.physics.runtime.device import choose_device
 from neuido.types import Body, Cameras, Gaussians, ParticleState, Scene, Walls
@@ -301,15 +299,11 @@ def _write_clip(plan: ClipPlan, folder: Path, clip: ClipSetup, filmed: dict[str,
 
 def _samples(motion: ParticleState, clip: ClipSetup, count: int) -> dict[str, Tensor]:
     """Sample the law at deformations of the motion: trial and corrected F, and stress, (n, 3, 3) each."""
-    elastic, plastic = laws(clip.family, [clip.parameters])
-    F, C = motion.F[1:].flatten(0, 1).double(), motion.C[1:].flatten(0, 1).double()
+    F, C = motion.F[1:].flatten(0, 1), motion.C[1:].flatten(0, 1)
     number = int(clip.name.removeprefix("clip-"))
     pick = torch.randint(len(F), (count,), generator=torch.Generator().manual_seed(number)).to(F.device)
-    trial = (F[pick] + clip.scene.dt * C[pick] @ F[pick]).float()
-    corrected = evaluate(plastic, trial)
-    if isinstance(plastic, VolumetricReset):  # as in the trajectories of Stage I, whose operator is frame-indifferent
-        corrected = (polar(trial.double())[0] @ corrected.double()).float()
-    return {"trial": trial.cpu(), "corrected": corrected.cpu(), "stress": evaluate(elastic, corrected).cpu()}
+    sampled = sample_laws(*laws(clip.family, [clip.parameters]), F[pick], C[pick], clip.scene.dt)
+    return {name: t.cpu() for name, t in zip(("trial", "corrected", "stress"), sampled)}
 
 
 def _material(plan: ClipPlan, number: int) -> tuple[str, dict[str, float]]:
