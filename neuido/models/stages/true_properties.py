@@ -1,8 +1,6 @@
 """The properties of made materials, with which readings are trained and compared."""
 
-import torch
-
-from neuido.data.bodies.families import effects, evaluate, laws
+from neuido.data.bodies.families import effects, laws
 from neuido.data.trajectories.reference_viscosity import reference_viscosity
 
 STRAIN = 1e-3
@@ -16,15 +14,10 @@ def properties_of(family: str, parameters: dict[str, float]) -> dict[str, float]
 
     E [Pa] and nu [-] are those at small strains, whatever the law's own parameters are; a fluid has neither.
     """
-    F = torch.eye(3) + STRAIN * torch.cat([torch.diag_embed(torch.eye(3)), -torch.diag_embed(torch.eye(3))])
-    stress = evaluate(laws(family, [parameters])[0], F).double().diagonal(dim1=-2, dim2=-1)
-    response = (stress[:3] - stress[3:]) / (2 * STRAIN)
-    along = float(response.diagonal().mean())
-    lam = (float(response.sum()) - 3 * along) / 6
-    mu = (along - lam) / 2
+    shear, bulk = (float(modulus) for modulus in laws(family, [parameters])[0].moduli())
     found = {}
-    if mu > FLUID * along:
-        found |= {"young": mu * (3 * lam + 2 * mu) / (lam + mu), "poisson": lam / (2 * (lam + mu))}
+    if shear > 0:  # else a fluid
+        found |= {"young": 9 * bulk * shear / (3 * bulk + shear), "poisson": (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear)}
     found |= {name: parameters[name] for name in ("yield_stress", "friction_angle") if name in parameters}
     viscosity = effective_viscosity(family, parameters)
     return found | ({"viscosity": viscosity} if viscosity > 0 else {})
