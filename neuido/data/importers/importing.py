@@ -116,16 +116,14 @@ def import_file(
         raise UserError(f"--kind {kind} is not for videos: leave it out, and give --cameras if the clips are views of one motion")
     outlines = films and kind == "body" and filming.cameras is None
     with naming(paths[0]):
-        chosen = (
-            "track"
-            if films
-            else "field"
-            if elements is not None and kind == "auto"
-            else _kind(paths[0], columns)
-            if kind == "auto"
-            else kind
-        )
-    chosen = "plane" if elements is not None and chosen == "field" else chosen
+        if films:
+            chosen = "track"
+        elif kind != "auto":
+            chosen = kind
+        else:
+            chosen = "field" if elements is not None else _kind(paths[0], columns)
+    if chosen == "field" and elements is not None:
+        chosen = "plane"
     guided = {key: value for key, value in guide._asdict().items() if value is not None and value != "none"}
     shared = guided.pop("length", None)  # of a specimen too
     dimensions = {"section_diameter" if key == "diameter" else key: value for key, value in (specimen or Specimen())._asdict().items()}
