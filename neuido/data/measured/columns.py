@@ -1,7 +1,7 @@
 """Shared parts of the readers of measured data: headers, CSV columns, declared effects and roles. The files are not trusted."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -113,6 +113,23 @@ def read_columns(folder: Path, entry: Mapping[str, Any], where: str, *, scale: M
         if not np.isfinite(out[key]).all():
             raise UserError(f"{where}: {path.name}, {title}: a number exceeds the range of floating point after scaling: check scale")
     return out, rows
+
+
+def optional_numbers(cells: Sequence[str], name_row: Callable[[int], str]) -> np.ndarray:
+    """Return the numbers of a column, (n,); NaN where a cell is empty or `nan`.
+
+    Args:
+        cells: The cells of the column.
+        name_row: Returns the words for a row, counted from 0, in error messages.
+
+    Raises:
+        UserError: Another cell is no number.
+    """
+    missing = [not cell or cell.lower() == "nan" for cell in cells]
+    wrong = next((i for i, cell in enumerate(cells) if not missing[i] and not is_number(cell)), None)
+    if wrong is not None:
+        raise UserError(f"{name_row(wrong)} is {cells[wrong]!r}, which is no number")
+    return np.array([np.nan if lacks else float(cell) for cell, lacks in zip(cells, missing)])
 
 
 def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str, float]:

@@ -1,6 +1,5 @@
 """Plane specimens: measured displacements of the nodes of a mesh and reaction forces, in the folder format `neuido-plane/1`."""
 
-import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,9 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.files.delimited import read_delimited
 from neuido.data.files.values import check_keys, file_name, mapping, number, path_inside
-from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
+from neuido.data.measured.columns import (
+    errors_of,
+    optional_numbers,
+    read_effects,
+    read_entries,
+    read_free,
+    read_header,
+    read_role,
+    read_text,
+)
 from neuido.data.measured.plausibility import MAX_UNIT_FACTOR, ODD_UNIT_FACTOR
 from neuido.errors import PlausibilityWarning, UserError
 from neuido.physics.plane.plane_law import EFFECTS, ENERGIES, PlaneLaw
@@ -241,10 +249,7 @@ def _table(
         texts[title] = cells
         if title.startswith("boundary_"):
             continue
-        for i, cell in enumerate(cells):
-            if cell and cell.lower() != "nan" and not is_number(cell):
-                raise UserError(f"{where}: {path.name}, line {table.lines[i + 1]}, {title} is {cell!r}, which is no number")
-        numbers[title] = np.array([float(cell) if cell else math.nan for cell in cells])
+        numbers[title] = optional_numbers(cells, lambda i, title=title: f"{where}: {path.name}, line {table.lines[i + 1]}, {title}")
     return numbers, texts
 
 
@@ -287,16 +292,17 @@ def _check_recording(
         )
     for step, moved in enumerate(u):
         whole = np.isfinite(moved).all(1)[found.specimen.triangles.numpy()].all(1)
-        F = found.specimen.gradient(torch.from_numpy(np.nan_to_num(moved))).numpy()[whole]
+        F = found.specimen.gradient(torch.from_numpy(moved)).numpy()[whole]
         turned = np.flatnonzero(F[:, 0] * F[:, 3] - F[:, 1] * F[:, 2] <= 0)
         if len(turned) > max(MOST_TURNED * len(F), 1):
             raise UserError(
                 f"{where}: load step {step} turns {len(turned)} of {len(F)} triangles inside out, the first is "
                 f"{np.flatnonzero(whole)[turned[0]]}: are the rows in the order of the nodes, and the displacements in m?"
             )
-    if not np.isfinite(force).any():
+    given = force[np.isfinite(force)]
+    if not len(given):
         return
-    if not np.nan_to_num(force).any():
+    if not given.any():
         raise UserError(f"{where}: all forces are zero: name the right columns of {', '.join(p.name for p in found.boundary)}")
     _check_forces(found, recording, where)
 
@@ -304,7 +310,7 @@ def _check_recording(
 def _check_forces(found: PlaneExperiment, recording: PlaneRecording, where: str) -> None:
     """Check sign, unit and balance of the forces."""
     force = recording.force
-    last = int(np.nanargmax(np.nanmax(np.abs(np.nan_to_num(force)), axis=1)))
+    last = int(np.nanargmax(np.abs(force))) // force.shape[1]
     for axis, a in enumerate(AXES):
         own = [i for i, part in enumerate(found.boundary) if part.axis == axis]
         if len(own) > 1 and np.isfinite(force[last, own]).all() and np.abs(force[last, own]).max() > 0:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import yaml
 
-from neuido.data.files.delimited import is_number, read_delimited
+from neuido.data.files.delimited import read_delimited
 from neuido.data.files.parsing import naming
 from neuido.data.files.writing import write_text
 from neuido.data.formats.layout import natural_key
@@ -17,6 +17,7 @@ from neuido.data.importers.machines.material_folder import Material
 from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.data.importers.tables.titles import bare_title
 from neuido.data.importers.tables.units import conversion_factor, parse_quantity
+from neuido.data.measured.columns import optional_numbers
 from neuido.data.measured.plane_experiment import AXES, Boundary, read_plane_experiment, stiffness_ratio
 from neuido.errors import UserError
 from neuido.physics.plane.plane_specimen import CONDITIONS, PlaneSpecimen
@@ -39,13 +40,9 @@ class Columns(NamedTuple):
         """Return a column as numbers, (n,).
 
         Raises:
-            UserError: A cell is none.
+            UserError: A cell is neither a number nor empty.
         """
-        cells = self.cells[title]
-        wrong = next((i for i, cell in enumerate(cells) if cell and cell.lower() != "nan" and not is_number(cell)), None)
-        if wrong is not None:
-            raise UserError(f"data row {wrong}, {title} is {cells[wrong]!r}, which is no number")
-        return np.array([float(cell) if cell else np.nan for cell in cells])
+        return optional_numbers(self.cells[title], lambda i: f"data row {i}, {title}")
 
     def first(self, titles: Sequence[str]) -> str | None:
         """Return the first of several titles that the table has."""
