@@ -155,23 +155,32 @@ def _specimen(given: Any, folder: Path) -> tuple[PlaneSpecimen, dict[str, list[s
     nodes, texts = _table(folder, given["nodes"], "specimen.nodes", AXES, tuple(f"boundary_{a}" for a in AXES))
     elements, _ = _table(folder, given["elements"], "specimen.elements", ("node1", "node2", "node3"), ("node4",))
     corners = np.stack([elements[f"node{i}"] for i in (1, 2, 3)], 1)
-    fourth = elements.get("node4", np.full(len(corners), np.nan))
-    whole = np.concatenate([corners.reshape(-1), fourth[np.isfinite(fourth)]])
-    if not np.isfinite(corners).all() or (whole != whole.round()).any() or (whole < 0).any():
+    if "node4" in elements:
+        corners = np.column_stack([corners, elements["node4"]])
+    whole = corners[np.isfinite(corners)]
+    if not np.isfinite(corners[:, :3]).all() or (whole != whole.round()).any() or (whole < 0).any():
         raise UserError(
             "specimen.elements: the nodes of an element must be whole numbers, counted from 0 in the order of the table of nodes"
         )
-    square = np.isfinite(fourth)
-    triangles = np.concatenate([corners, np.stack([corners[square, 0], corners[square, 2], fourth[square]], 1)]).astype(int)
     thickness = number(given["thickness"], "specimen.thickness", above=0.0)
     if given["condition"] not in CONDITIONS:
         raise UserError(f"specimen.condition = {given['condition']!r} is unknown: choose from {', '.join(CONDITIONS)}")
     try:
         places = torch.from_numpy(np.stack([nodes[a] for a in AXES], 1))
-        specimen = PlaneSpecimen(places, torch.from_numpy(triangles), thickness, given["condition"])
+        specimen = PlaneSpecimen(places, torch.from_numpy(triangles_of(corners)), thickness, given["condition"])
     except UserError as error:
         raise UserError(f"specimen: {error}") from error
     return specimen, {a: texts.get(f"boundary_{a}", [""] * len(places)) for a in AXES}
+
+
+def triangles_of(elements: np.ndarray) -> np.ndarray:
+    """Return the nodes of the triangles of elements, (E, 3); the second triangles of quadrilaterals follow all first ones.
+
+    Args:
+        elements: Nodes of the elements, (n, 3) or (n, 4); the fourth is NaN where an element is a triangle.
+    """
+    squares = elements[np.isfinite(elements).sum(1) == 4]
+    return np.concatenate([elements[:, :3], squares[:, [0, 2, -1]]]).astype(int)
 
 
 def _boundary(motions: Any, marks: Mapping[str, Sequence[str]]) -> tuple[Boundary, ...]:

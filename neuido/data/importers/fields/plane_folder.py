@@ -18,7 +18,7 @@ from neuido.data.importers.tables.checked_folder import write_checked
 from neuido.data.importers.tables.titles import bare_title
 from neuido.data.importers.tables.units import conversion_factor, parse_quantity
 from neuido.data.measured.columns import optional_numbers
-from neuido.data.measured.plane_experiment import AXES, Boundary, read_plane_experiment, stiffness_ratio
+from neuido.data.measured.plane_experiment import AXES, Boundary, read_plane_experiment, stiffness_ratio, triangles_of
 from neuido.errors import UserError
 from neuido.physics.plane.plane_specimen import CONDITIONS, PlaneSpecimen
 
@@ -135,7 +135,8 @@ def write_plane_folder(
 
     def fill(folder: Path) -> None:
         _write(folder / "nodes.csv", ("x", "y", "boundary_x", "boundary_y"), zip(*x.T.tolist(), marks["x"], marks["y"]))
-        _write(folder / "elements.csv", tuple(f"node{i + 1}" for i in range(max(map(len, corners)))), corners)
+        titles = tuple(f"node{i + 1}" for i in range(corners.shape[1]))
+        _write(folder / "elements.csv", titles, (["" if np.isnan(node) else int(node) for node in row] for row in corners))
         for name, u in zip(steps, moved):
             _write(folder / f"{name}.csv", ("ux", "uy"), u.tolist())
         for entry in content["recordings"]:
@@ -174,8 +175,8 @@ def _marks(table: Columns, axis: str, count: int) -> list[str]:
     return [""] * count if title is None else ["" if cell in ("0", "0.0") else cell for cell in table.cells[title]]
 
 
-def _elements(file: str, nodes: Columns) -> list[list[int]]:
-    """Return the nodes of each element, counted from 0."""
+def _elements(file: str, nodes: Columns) -> np.ndarray:
+    """Return the nodes of each element, counted from 0, (n, 3) or (n, 4); NaN where there is no fourth."""
     path = Path(file).expanduser()
     with naming(path):
         table = _columns(path)
@@ -185,14 +186,14 @@ def _elements(file: str, nodes: Columns) -> list[list[int]]:
         values = np.stack([table.numbers(title) for title in titles], 1)
         known = nodes.numbers("id") if "id" in nodes.cells else np.arange(len(nodes.cells["x"])) + (1 if np.nanmin(values) >= 1 else 0)
         number = {int(name): i for i, name in enumerate(known)}
-        out = []
+        out = np.full(values.shape, np.nan)
         for i, row in enumerate(values):
             own = row[np.isfinite(row)]
             lost = next((int(value) for value in own if int(value) not in number), None)
             if len(own) < 3 or lost is not None:
                 raise UserError(f"element {i} names {'too few nodes' if lost is None else f'the node {lost}, which is not there'}")
-            out.append([number[int(value)] for value in own])
-        return [[*row, ""][: max(map(len, out))] for row in out] if len({len(row) for row in out}) > 1 else out  # type: ignore[list-item]
+            out[i, : len(own)] = [number[int(value)] for value in own]
+        return out[:, np.isfinite(out).any(0)]
 
 
 def _forces(file: str, steps: int, parts: Sequence[str], units: Mapping[str, str]) -> np.ndarray:
@@ -240,7 +241,7 @@ def _roles(names: Sequence[str], held_out: Sequence[str]) -> dict[str, str]:
 
 def _young(
     x: np.ndarray,
-    corners: Sequence[Sequence[int]],
+    corners: np.ndarray,
     thickness: float,
     condition: str,
     parts: Sequence[Boundary],
@@ -251,8 +252,7 @@ def _young(
     """Return Young's modulus that the first load step with forces shows [Pa], with a note."""
     if force is None:
         return 1e6, "no forces (--forces): Young's modulus has no part in the displacements, 1 MPa is declared"
-    triangles = [row[:3] for row in corners] + [[row[0], row[2], row[3]] for row in corners if len(row) > 3 and row[3] != ""]
-    specimen = PlaneSpecimen(torch.from_numpy(x), torch.tensor(triangles), thickness, condition)
+    specimen = PlaneSpecimen(torch.from_numpy(x), torch.from_numpy(triangles_of(corners)), thickness, condition)
     for u, own in zip(moved, force):
         ratio = stiffness_ratio(specimen, parts, u, own, {"young": 1.0, "poisson": poisson}) if np.isfinite(own).any() else None
         if ratio is not None and ratio > 0:

@@ -48,6 +48,16 @@ def test_steps_of_a_finite_element_program(tmp_path):
     assert found.model["elasticity"]["young"] == pytest.approx(200 / (1e-3 * 2e-3) / 0.1, rel=0.3)
 
 
+def test_quadrilaterals_beside_triangles(tmp_path):
+    files = raw(tmp_path)
+    (tmp_path / "elements.csv").write_text("node1,node2,node3,node4\n10,11,12,14\n12,13,14,\n13,10,14,\n")
+    assert any("5 nodes, 3 elements" in line for line in read(tmp_path, files))
+    assert (tmp_path / "out" / "elements.csv").read_text() == "node1,node2,node3,node4\n0,1,2,4\n2,3,4,\n3,0,4,\n"
+    found = neuido.read_plane_experiment(tmp_path / "out")
+    assert found.specimen.triangles.tolist() == [[0, 1, 2], [2, 3, 4], [3, 0, 4], [0, 2, 4]]
+    assert found.model["elasticity"]["young"] == pytest.approx(200 / (1e-3 * 2e-3) / 0.1, rel=0.3)
+
+
 def test_places_and_forces_in_tables_of_their_own(tmp_path):
     (tmp_path / "nodes.csv").write_text(
         "x [mm],y [mm],boundary_x,boundary_y\n"
