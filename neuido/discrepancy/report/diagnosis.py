@@ -311,14 +311,19 @@ def _figure(q: Quantity) -> str:
 
 
 def _field(ax: Any, arrays: Mapping[str, Any], content: Mapping[str, Any], units: Units) -> None:
-    """Draw the size of the residual of a plane specimen at the last load step, with the effects where some are named."""
+    """Draw the size of the residual of a plane specimen at the last load step, with the effects where some are named.
+
+    A triangle with a node that was not seen is left blank.
+    """
     import numpy as np
 
     when = "after" if content["effects"] else "before"
     factor, unit = units.scaled("m")
     place = factor * (arrays["nodes"] + arrays[f"moved_{when}"][-1])
     size = factor * np.linalg.norm((arrays["moved_measured"] - arrays[f"moved_{when}"])[-1], axis=1)
-    shown = ax.tripcolor(*place.T, np.nan_to_num(size), triangles=arrays["triangles"], shading="gouraud")
+    triangles = arrays["triangles"]
+    unseen = np.isnan(size)[triangles].any(1)
+    shown = ax.tripcolor(*place.T, np.nan_to_num(size), triangles=triangles, mask=unseen, shading="gouraud")
     ax.set(aspect="equal", xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
     ax.plot([], [], label=f"residual {when}")
     ax.figure.colorbar(shown, ax=ax, label=f"residual [{unit}]")

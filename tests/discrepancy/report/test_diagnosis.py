@@ -6,8 +6,10 @@ import shutil
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 import yaml
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from neuido.data.measured.material_test import read_material_tests
 from neuido.data.measured.track import read_tracks
@@ -136,6 +138,26 @@ def test_names_of_a_file_are_no_paths(tmp_path):
     (tmp_path / "sub" / "predicted").mkdir()
     shutil.copy(OLDER / "predicted" / "throw.npz", tmp_path / "sub" / "throw.npz")
     assert Diagnosis.read(tmp_path / "sub").motion() == {}
+
+
+def test_nodes_that_were_not_seen_are_left_blank(tmp_path):
+    """A square of two triangles; a node of the second was not seen."""
+    shutil.copytree(OLDER, tmp_path / "own")
+    nodes, triangles = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=float), np.array([[0, 1, 2], [1, 3, 2]])
+    moved = np.zeros((1, 4, 2))
+    measured = moved.copy()
+    measured[0, :3, 0], measured[0, 3] = (0.1, 0.2, 0.3), np.nan
+    fields = {"nodes": nodes, "triangles": triangles, "moved_before": moved, "moved_after": moved, "moved_measured": measured}
+    np.savez(tmp_path / "own" / "predicted" / "throw.npz", before=np.zeros(1), **fields)
+    figure = Diagnosis.read(tmp_path / "own").plot()
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[::-1]  # from below
+    (ax,) = (one for one in figure.axes if one.get_xlabel().startswith("x "))
+    factor = ax.collections[0].get_datalim(ax.transData).x1  # a metre in the unit of the axis
+    seen, blank = (ax.transData.transform(factor * nodes[t].mean(0)).astype(int) for t in triangles)
+    assert pixels[blank[1], blank[0], :3].tolist() == [255, 255, 255]
+    assert pixels[seen[1], seen[0], :3].tolist() != [255, 255, 255]
 
 
 def test_read_again(found):
