@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.colliders.solid_contact import DAMPING, PARTING
+from neuido.physics.colliders.solid_contact import spring_functions
 from neuido.physics.multibody import reach_kernels
 from neuido.physics.multibody.reach_kernels import FAR
 from neuido.physics.runtime.device import start_warp
@@ -51,6 +51,8 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
     name = f"neuido.contact.{real.__name__}"
     func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    springs = spring_functions(real, name)
+    push_of, change, change_adjoint = springs.push_of, springs.change, springs.change_adjoint
     own = stencil(real, name, native=False)
     spline, spline_slope, first_node, stencil_offset = own.spline, own.spline_slope, own.first_node, own.stencil_offset
     flat_index, velocity_of = own.flat_index, own.velocity_of
@@ -183,26 +185,6 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
             out = vec3(real(0.0), real(0.0), real(0.0))
         return out
 
-    @func
-    def push_of(overlap: real, rn: real, h: real, dt: real):
-        """Return the change of the normal relative velocity by the contact; rn is that before, positive where the bodies approach."""
-        return wp.max(
-            real(0.0), wp.min(wp.static(real(PUSH)) * overlap / dt + wp.static(real(DAMPING)) * rn, rn + wp.static(real(PARTING)) * h / dt)
-        )
-
-    @func
-    def change(r: vec3, n: vec3, friction: real, push: real):
-        """Return the change of the relative velocity r by contact; n points from the first body to the second."""
-        t = r - wp.dot(r, n) * n
-        speed = wp.length(t)
-        out = -push * n
-        if push > real(0.0):
-            if speed < friction * push:
-                out = out - t
-            else:
-                out = out - (friction * push / wp.max(speed, real(1.0e-30))) * t
-        return out
-
     @kernel
     def exchange(
         first: wp.array(dtype=wp.int32),
@@ -239,9 +221,8 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                         if length > real(0.0) and qa[3] > real(0.0) and qb[3] > real(0.0):
                             r = velocity_of(qa) / qa[3] - velocity_of(qb) / qb[3]
                             mu = friction[s, (a - first[s]) * bodies + b - first[s]]
-                            n = d / length
-                            push = push_of(w[2], wp.dot(r, n), dx[s], dt[s])
-                            J = (qa[3] * qb[3] / total) * change(r, n, mu, push)
+                            pressed = wp.static(real(PUSH)) * w[2] / dt[s]
+                            J = (qa[3] * qb[3] / total) * change(r, -d / length, pressed, dx[s] / dt[s], mu)
                             given = vec4(J[0], J[1], J[2], real(0.0))
                             out[a * size + node] = out[a * size + node] + given
                             out[b * size + node] = out[b * size + node] - given
@@ -293,32 +274,19 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                             va = velocity_of(qa) / qa[3]
                             vb = velocity_of(qb) / qb[3]
                             r = va - vb
-                            n = d / length
+                            n = -d / length  # from b to a, as a is pressed
                             pair = (a - first[s]) * bodies + b - first[s]
                             mu = friction[s, pair]
-                            rn = wp.dot(r, n)
-                            push = push_of(w[2], rn, dx[s], dt[s])
-                            if push > real(0.0):
+                            given = wp.static(real(PUSH)) * w[2] / dt[s]
+                            cell = dx[s] / dt[s]
+                            if push_of(given, wp.dot(r, n), cell) > real(0.0):
                                 A = velocity_of(a_out[a * size + node]) - velocity_of(a_out[b * size + node])
                                 share = qa[3] * qb[3] / total
-                                a_share = wp.dot(A, change(r, n, mu, push))
-                                A = share * A
-                                t = r - rn * n
-                                speed = wp.length(t)
-                                a_push = -wp.dot(n, A)
-                                an = -push * A
-                                at_ = -A
-                                if speed >= mu * push:
-                                    safe = wp.max(speed, real(1.0e-30))
-                                    e = t / safe
-                                    eA = wp.dot(e, A)
-                                    at_ = (-mu * push / safe) * (A - eA * e)
-                                    a_push -= mu * eA
-                                    wp.atomic_add(a_friction, s, pair, -push * eA)
-                                ar = at_ - wp.dot(at_, n) * n
-                                an = an - wp.dot(at_, n) * r - rn * at_
-                                spring = wp.static(real(PUSH)) / dt[s]
-                                if spring * w[2] + wp.static(real(DAMPING)) * rn < rn + wp.static(real(PARTING)) * dx[s] / dt[s]:
+                                a_share = wp.dot(A, change(r, n, given, cell, mu))
+                                ar, an, a_given, a_mu = change_adjoint(r, n, given, cell, mu, share * A)
+                                wp.atomic_add(a_friction, s, pair, a_mu)
+                                if a_given != real(0.0):
+                                    a_overlap = wp.static(real(PUSH)) * a_given / dt[s]
                                     ca = a_reach.shape[1] / 2 + b - first[s]
                                     cb = a_reach.shape[1] / 2 + a - first[s]
                                     if w[1] == real(0.0):
@@ -327,14 +295,9 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                                     elif w[0] == real(0.0):
                                         ca = b - first[s]
                                         cb = ca
-                                    a_reach[a * size + node, ca] = a_reach[a * size + node, ca] + spring * a_push
-                                    a_reach[b * size + node, cb] = a_reach[b * size + node, cb] + spring * a_push
-                                    ar = ar + wp.static(real(DAMPING)) * a_push * n
-                                    an = an + wp.static(real(DAMPING)) * a_push * r
-                                else:
-                                    ar = ar + a_push * n
-                                    an = an + a_push * r
-                                ad = (an - wp.dot(n, an) * n) / length
+                                    a_reach[a * size + node, ca] = a_reach[a * size + node, ca] + a_overlap
+                                    a_reach[b * size + node, cb] = a_reach[b * size + node, cb] + a_overlap
+                                ad = (wp.dot(n, an) * n - an) / length
                                 a_gradient[a * size + node] = a_gradient[a * size + node] + w[0] * ad
                                 a_gradient[b * size + node] = a_gradient[b * size + node] + w[1] * ad
                                 ba = ar / qa[3]

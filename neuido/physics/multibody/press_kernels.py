@@ -15,7 +15,7 @@ import warp as wp
 
 from neuido.physics.colliders import signed_distance
 from neuido.physics.colliders.contact import SEPARATE
-from neuido.physics.colliders.solid_contact import STATE
+from neuido.physics.colliders.solid_contact import STATE, pose_functions
 from neuido.physics.multibody.contact_kernels import PUSH
 from neuido.physics.runtime.device import start_warp
 from neuido.physics.runtime.once import cached
@@ -32,33 +32,17 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
     start_warp()
     vec3 = wp.types.vector(length=3, dtype=real)
     vec4 = wp.types.vector(length=4, dtype=real)
-    quat = wp.types.quaternion(dtype=real)
     state_vec = wp.types.vector(length=STATE, dtype=wp.float64)
     name = f"neuido.press.{real.__name__}"
-    func = functools.partial(wp.func, module=name)
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     shapes = signed_distance.functions(real, name)
     distance, distance_adjoint = shapes.distance, shapes.distance_adjoint
+    pose = pose_functions(real, name)
+    arm_of, turn_of, pose_adjoint = pose.arm_of, pose.turn_of, pose.pose_adjoint
+    turn_adjoint, turn_back_adjoint = pose.turn_adjoint, pose.turn_back_adjoint
     own = stencil(real, name, native=False)
     spline, spline_slope, first_node = own.spline, own.spline_slope, own.first_node
     stencil_offset, flat_index = own.stencil_offset, own.flat_index
-
-    @func
-    def turn_of(st: state_vec):
-        return quat(real(st[4]), real(st[5]), real(st[6]), real(st[3]))
-
-    @func
-    def arm_of(st: state_vec, x: vec3):
-        return x - vec3(real(st[0]), real(st[1]), real(st[2]))
-
-    @func
-    def turn_adjoint(q: quat, y: vec3, a: vec3):
-        """Return the adjoint of q (x, y, z, w), not held to unit length, for the adjoint a of `quat_rotate(q, y)`."""
-        u = vec3(q[0], q[1], q[2])
-        w = q[3]
-        au = real(2.0) * (w * wp.cross(y, a) + wp.dot(u, y) * a + wp.dot(u, a) * y)
-        aw = real(4.0) * w * wp.dot(a, y) + real(2.0) * wp.dot(a, wp.cross(u, y))
-        return vec4(au[0], au[1], au[2], aw)
 
     @kernel
     def press(
@@ -176,14 +160,8 @@ def build(real: type, stencil: Callable[..., SimpleNamespace]) -> SimpleNamespac
                             shape[s, c], size[s, c], samples, info[s, c], y, local, wp.quat_rotate_inv(q, an), -scale * along
                         )
                         ar = wp.quat_rotate(q, ay)
-                        back = turn_adjoint(quat(-q[0], -q[1], -q[2], q[3]), r, ay)
-                        aq = turn_adjoint(q, local, an) + vec4(-back[0], -back[1], -back[2], back[3])
+                        aq = turn_adjoint(q, local, an) + turn_back_adjoint(q, r, ay)
                         a_x[p] = a_x[p] + aw / h + ar
-                        of_state = state_vec()
-                        for k in range(3):
-                            of_state[k] = -wp.float64(ar[k])
-                            of_state[4 + k] = wp.float64(aq[k])
-                        of_state[3] = wp.float64(aq[3])
-                        wp.atomic_add(a_state, step, s, c, of_state)
+                        wp.atomic_add(a_state, step, s, c, pose_adjoint(ar, aq))
 
     return SimpleNamespace(press=press, press_adjoint=press_adjoint)
