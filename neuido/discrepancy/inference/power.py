@@ -1,7 +1,7 @@
 """Upper limits on the sizes of effects that were not found: how large could each effect be without being detected?"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +40,8 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
     size of the discretisation error after a refit, and from errors of the instruments that no nuisance has (`Problem.instrument_errors`).
     If the residual is larger than all of these, or neighbouring data err alike, the uncertainty grows with it: a residual of few
     independent data may hide an effect of its own size (`excess`). The prior is flat, over one sign if the effect has only one. Of several
-    shapes of an effect, the largest limit counts. The directions are those of the screening, so that hardly anything is simulated anew
-    after a search.
+    shapes of an effect, the largest limit counts. Recordings of the same data count as one measurement. The directions are those of the
+    screening, so that hardly anything is simulated anew after a search.
 
     Args:
         lab: The method that gives the answer.
@@ -63,9 +63,19 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
         slopes = directions.slopes(lab, free, r.base, recordings)
         columns = directions.candidate_columns(lab, r.base, candidates, recordings)
     beside = [columns[t.candidate.key, 0] for t in found if (t.candidate.key, 0) in columns and t.candidate.name not in own]
-    project = directions.project_out_slopes(
-        lab, {n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}, at.floor
+    copies = _copies(lab)
+    weights = {n: len(own) ** -0.5 for own in copies for n in own}
+
+    def once(columns: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+        return {n: weights[n] * columns[n] for n in recordings}
+
+    project_all = directions.project_out_slopes(
+        lab, once({n: np.concatenate([slopes[n], *(c[n] for c in beside)], axis=1) for n in recordings}), at.floor
     )
+
+    def project(columns: Mapping[int, np.ndarray]) -> np.ndarray:
+        return project_all(once(columns))
+
     left = project({n: lab.residual(at.fit.point, n) for n in recordings})
     unseen = {}
     for part, square in zip(lab.parts, r.floors - lab.noise_squares, strict=True):
@@ -73,8 +83,9 @@ def compatible(lab: Laboratory, at: Stand, r: Round, found: Sequence[Trial] = ()
             own_rows = patterns(problem, r.floor, part, square)
             unseen[part.recording] = np.zeros((len(part.rows), own_rows.shape[1]))
             unseen[part.recording][part.rows] = own_rows
-    S = np.concatenate([project(unseen), project(_each_its_own(lab, at.fit.point))], axis=1)
-    growth, freedom = excess(left, S, _series(lab))
+    S = np.concatenate([project(unseen), project(_each_its_own(lab, at.fit.point, copies))], axis=1)
+    count = sum(weights[part.recording] ** 2 * int(part.rows.sum()) for part in lab.parts if part.fitted)
+    growth, freedom = excess(left, S, _series(lab), count)
     largest: dict[tuple[str, str], Compatible] = {}
     for c in candidates:
         if c.name in taken:
@@ -108,7 +119,7 @@ def amounts(B: np.ndarray, left: np.ndarray, S: np.ndarray) -> tuple[np.ndarray,
     return -inverse @ (B.T @ left), np.where(squares > 0.0, np.sqrt(variances), math.inf)
 
 
-def excess(left: np.ndarray, S: np.ndarray, series: Sequence[np.ndarray]) -> tuple[float, float]:
+def excess(left: np.ndarray, S: np.ndarray, series: Sequence[np.ndarray], count: float | None = None) -> tuple[float, float]:
     """Return the factor by which a residual enlarges the variance of what is fitted to it, and the degrees of freedom of that estimate.
 
     The factor is the mean square of the residual (Birge's ratio), divided by the share of the data that is independent. That share is
@@ -118,8 +129,9 @@ def excess(left: np.ndarray, S: np.ndarray, series: Sequence[np.ndarray]) -> tup
         left: Residual, (n,), whitened.
         S: Patterns that `left` may hold beside white noise, (n, s), with amounts of variance one.
         series: Indices of the data of each series, in the order of time.
+        count: Number of data that `left` stands for; its length by default.
     """
-    n = max(len(left), 1)
+    n = max(len(left) if count is None else count, 1)
     white = left - S @ np.linalg.solve(np.eye(S.shape[1]) + S.T @ S, S.T @ left)
     products = sum(float(white[i[1:]] @ white[i[:-1]]) for i in series)
     alike = float(np.clip(products / max(float(white @ white), 1e-300), 0.0, 1 - 2 / (n + 1)))  # so that one datum is left at the least
@@ -127,14 +139,24 @@ def excess(left: np.ndarray, S: np.ndarray, series: Sequence[np.ndarray]) -> tup
     return max(float(left @ white) / independent, 1.0), max(independent - 1, 1.0)
 
 
-def _each_its_own(lab: Laboratory, point: Point) -> dict[int, np.ndarray]:
-    """Return the errors of the instruments of each fitted recording, (n, k): columns of their own, zero in the other recordings."""
+def _copies(lab: Laboratory) -> list[list[int]]:
+    """Return the fitted recordings in lists of the same data: a copy of a recording is no second measurement."""
+    found: dict[tuple[bytes, ...], list[int]] = {}
+    for n in lab.fitted_recordings:
+        own = lab.problem.recordings[n]
+        found.setdefault(tuple(part.tobytes() for part in (own.y, own.groups, own.times)), []).append(n)
+    return list(found.values())
+
+
+def _each_its_own(lab: Laboratory, point: Point, copies: Sequence[Sequence[int]]) -> dict[int, np.ndarray]:
+    """Return the errors of the instruments of each fitted recording, (n, k): columns of its own and its copies', zero in the others."""
     found = {n: lab.problem.instrument_errors(point, n) for n in lab.fitted_recordings}
-    width, out, begun = sum(own.shape[1] for own in found.values()), {}, 0
-    for n, own in found.items():
-        out[n] = np.zeros((len(own), width))
-        out[n][:, begun : begun + own.shape[1]] = own
-        begun += own.shape[1]
+    width, out, begun = sum(found[own[0]].shape[1] for own in copies), {}, 0
+    for own in copies:
+        for n in own:
+            out[n] = np.zeros((len(found[n]), width))
+            out[n][:, begun : begun + found[n].shape[1]] = found[n]
+        begun += found[own[0]].shape[1]
     return out
 
 
