@@ -12,7 +12,8 @@
     if (value && typeof value === "object") return Object.fromEntries(Object.entries(value).map(([k, v]) => [k, filled(v)]));
     return value;
   };
-  const config = { responsive: true, displaylogo: false, displayModeBar: "hover" };
+  const narrow = window.matchMedia("(max-width: 600px)").matches; // there the mode bar would lie over the legend
+  const config = { responsive: true, displaylogo: false, displayModeBar: narrow ? false : "hover" };
   const axis = () => ({ gridcolor: colour("rule"), zerolinecolor: colour("rule"), linecolor: colour("soft"), automargin: true });
   const flat = layout => {
     const out = { paper_bgcolor: colour("paper"), plot_bgcolor: colour("paper"), font: { color: colour("ink"), size: 12 }, height: 360,
