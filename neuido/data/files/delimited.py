@@ -9,7 +9,7 @@ from neuido.data.files.parsing import one_line
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import check_limit
 
-DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","), (",", ","))
+DIALECTS = ((",", "."), (";", ","), (";", "."), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","), ("|", "."), ("|", ","), (",", ","))
 """Separators and decimal signs, the most likely first; a blank means any white space. The last one is of numbers in quotation marks."""
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")  # each digit is matched in one way: no time grows with the square
 _COMMA = re.compile(r"[+-]?(\d+|\d*,\d+)([eE][+-]?\d+)?")
@@ -60,7 +60,7 @@ def read_delimited(path: Path) -> Delimited:
         UserError: The file is missing, too large or not text.
     """
     text, encoding = _decoded(path)
-    cells = max(text.count(separator) for separator in ",;\t ") + text.count("\n") + text.count("\r")
+    cells = max(text.count(separator) for separator in ",;\t |") + text.count("\n") + text.count("\r")
     check_limit(cells, "NEUIDO_MAX_TABLE_CELLS", f"{path} has {cells} cells")
     numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
     separator, decimal = _dialect([line for _, line in numbered[-_SAMPLE:]])

@@ -42,6 +42,10 @@ ROOM, EMPTY = 3.0, 1e5
 """Volume of the particles, relative to the box about them, above which its unit is doubtful, and inverse of that below which it is."""
 
 
+FOOT, MAX_FEET = 0.3048, 0.05
+"""A foot [m], and how far an acceleration may be from gravity in feet where that unit is meant: drag and the scale are within it."""
+
+
 def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where: str) -> None:
     """Check that the coordinates of a flight are in metres, and its times in seconds, with the declared direction of gravity.
 
@@ -65,9 +69,13 @@ def check_flight(t: np.ndarray, x: np.ndarray, gravity: float, axis: str, where:
     acceleration = 2 * parabola.coef[2] / (t[-1] - t[0]) ** 2
     ratio = acceleration / gravity
     slow = abs(ratio) < SLOWEST and of_line > max(MAX_LEFT, 3 * left)
-    if left > MAX_LEFT or not (abs(ratio) > FASTEST or -1.3 < ratio < -0.7 or slow):
+    feet = 1 - MAX_FEET < abs(ratio) * FOOT < 1 + MAX_FEET
+    if left > MAX_LEFT or not (abs(ratio) > FASTEST or -1.3 < ratio < -0.7 or slow or feet):
         return
     told = f"{where}: the acceleration along {axis} is {acceleration:.4g} /s^2, {ratio:.3g} times model.gravity"
+    if feet:
+        _warn(f"{told}: are the positions in feet? Then give scale: {{{axis}: {math.copysign(FOOT, ratio):.4g}}}, or --units.x ft")
+        return
     if slow:
         raise UserError(
             f"{told}; are the times in ms or frames? Give about scale: {{t: {math.sqrt(abs(ratio)):.3g}}}; or set model.gravity to zero "

@@ -5,6 +5,7 @@ numbers. `effects.constitutive` has the same effects in three dimensions; the te
 """
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from typing import Any, NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from neuido.errors import UserError, suggest
 from neuido.physics.laws.base import ElasticLaw
 from neuido.physics.laws.classical_kernels import LOCKED
 from neuido.physics.laws.parametric import lame
+from neuido.physics.plane.plane_yield import elastic_part, inverse, product
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """Components 11, 12, 21, 22 and 33 of each triangle, (E,) each."""
@@ -86,6 +88,7 @@ PARAMETERS = {
     "second_invariant": ("c",),
     "fibre": ("c", "azimuth", "elevation"),
     "stiffness_gradient": ("x", "y"),
+    "yield": ("inverse",),
 }
 """Parameters of the effects of the library that act in a plane specimen."""
 EFFECTS = tuple(PARAMETERS)
@@ -125,6 +128,10 @@ class PlaneLaw:
         self._named = {key.partition(".")[0] for key in self._values}
         self.turns = name == "linear" and self._named <= {"fibre", "stiffness_gradient"}
         """Whether the energy stays finite where a triangle turns inside out, as in small-strain elasticity at large strain."""
+        self.yields = float(self._value("yield", "inverse").detach()) > 0
+        """Whether the stress depends on what was before, so that a motion is followed in parts (`after`)."""
+        self.plastic: Tensor | None = None
+        """Inverse of the plastic part of the gradient before the step, (E, 5); None where nothing yielded."""
         self._differentiable = any(t.requires_grad for t in (young, poisson, *self._values.values()))
         self._factor = None
         if "stiffness_gradient" in self._named:
@@ -136,6 +143,31 @@ class PlaneLaw:
 
     def _value(self, effect: str, part: str) -> Tensor:
         return self._values.get(f"{effect}.{part}", torch.zeros((), dtype=torch.float64))
+
+    def after(self, F: Tensor) -> "PlaneLaw":
+        """Return the law after a step to gradients (E, 5); it is this one where nothing can yield."""
+        if not self.yields:
+            return self
+        own = copy(self)
+        own.plastic = torch.stack(product(inverse(F.unbind(1)), self._elastic(F.unbind(1))), 1)  # type: ignore[arg-type]
+        return own
+
+    def _elastic(self, F: Five) -> Five:
+        """Return the elastic part of gradients."""
+        trial = F if self.plastic is None else product(F, self.plastic.unbind(1))  # type: ignore[arg-type]
+        two_mu = 2 * self.moduli.mu * (1.0 if self._factor is None else self._factor)
+        return elastic_part(trial, two_mu, self._value("yield", "inverse"))
+
+    def _first(self, F: Five, *, create_graph: bool) -> tuple[Tensor, ...]:
+        """Return the first Piola-Kirchhoff stress [Pa] of gradients that need derivatives; that of the elastic part, P F_e^T F^-T."""
+        if not self.yields:
+            return torch.autograd.grad(self.energy(F).sum(), F, create_graph=create_graph)
+        own = tuple(part.requires_grad_() if part.is_leaf else part for part in self._elastic(F))
+        P = torch.autograd.grad(self.energy(own).sum(), own, create_graph=True)  # type: ignore[arg-type]
+        a, b, c, d, l = own
+        p, q, r, s, m = product(P, (a, c, b, d, l))  # type: ignore[arg-type]
+        i, j, k, n, o = inverse(F)
+        return product((p, q, r, s, m), (i, k, j, n, o))
 
     def energy(self, F: Five) -> Tensor:
         """Return the strain energy of each triangle per volume at rest [J/m^3], (E,)."""
@@ -175,8 +207,8 @@ class PlaneLaw:
         kept = F.requires_grad or self._differentiable
         with torch.enable_grad():
             at = [part.contiguous() if part.requires_grad else part.detach().contiguous().requires_grad_() for part in F.unbind(1)]
-            P = torch.autograd.grad(self.energy(tuple(at)).sum(), at, create_graph=kept)  # type: ignore[arg-type]
-        return torch.stack(P, 1)
+            P = self._first(tuple(at), create_graph=kept)  # type: ignore[arg-type]
+        return torch.stack(P, 1) if kept else torch.stack(P, 1).detach()
 
     def across(self, F: Tensor) -> tuple[Tensor, Tensor]:
         """Return the stress across the plane (E,) [Pa] and its derivative by the stretch of the thickness (E,), both detached."""
@@ -190,7 +222,7 @@ class PlaneLaw:
         """Return the stress (E, 5) [Pa] and its derivative by the gradient (E, 5, 5), both detached."""
         with torch.enable_grad():
             at = [part.detach().contiguous().requires_grad_() for part in F.unbind(1)]
-            P = torch.autograd.grad(self.energy(tuple(at)).sum(), at, create_graph=True)  # type: ignore[arg-type]
+            P = self._first(tuple(at), create_graph=True)  # type: ignore[arg-type]
             rows = [torch.autograd.grad(P[i].sum(), at, retain_graph=i < 4, materialize_grads=True) for i in range(5)]
         return torch.stack(P, 1).detach(), torch.stack([torch.stack(row, 1) for row in rows], 1)
 

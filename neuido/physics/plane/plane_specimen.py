@@ -30,6 +30,8 @@ CLOSE = 0.3
 """Largest ratio of two successive imbalances at which the stiffness of another solution is still used in place of a new one."""
 FAST = 1e-7
 """Largest imbalance that `near` leaves, relative to the largest force of a node: far below what a measurement tells."""
+PARTS = 4
+"""Parts of a load step in which a law that yields is followed. The plastic strain is that of the end of each part."""
 UNDEFORMED = torch.tensor([1.0, 0.0, 0.0, 1.0], dtype=torch.float64)
 
 
@@ -113,8 +115,13 @@ class PlaneSpecimen:
         own = law if isinstance(law, PlaneLaw) else SpatialLaw(law)
         u, out, forces = torch.zeros_like(self.nodes), [], []
         for step, target in enumerate(motion):
-            u = self.towards(own, fixed, u, target.detach(), step).displacement
-            moved, force = self._derived(own, fixed, u, target)
+            begun, moved, force = u, u, u
+            for share in parts_of(own):
+                here = begun + share * (target - begun)
+                u = self.towards(own, fixed, u, here.detach(), step).displacement
+                moved, force = self._derived(own, fixed, u, here)
+                own = own.after(self._whole_derived(own, self.gradient(moved))) if isinstance(own, PlaneLaw) else own
+            u = moved.detach()
             out.append(moved)
             forces.append(force)
         return PlaneMotion(torch.stack(out), torch.stack(forces))
@@ -167,6 +174,27 @@ class PlaneSpecimen:
             u = solution.displacement
         assert solution is not None
         return solution
+
+    def followed(self, law: PlaneLaw, fixed: Tensor, begun: Tensor, target: Tensor, step: int) -> tuple["Solution", PlaneLaw, PlaneLaw]:
+        """Compute the equilibrium of a load step by a law that may yield, without derivatives.
+
+        Args:
+            law, fixed, begun, target, step: As of `towards`.
+
+        Returns:
+            The equilibrium, the law before its last part, and the law after it.
+
+        Raises:
+            UserError: There is no equilibrium.
+        """
+        u, before, solution = begun, law, None
+        for share in parts_of(law):
+            before = law
+            solution = self.towards(law, fixed, u, begun + share * (target - begun), step)
+            u = solution.displacement
+            law = law.after(self.whole(law, self.gradient(u))) if law.yields else law
+        assert solution is not None
+        return solution, before, law
 
     def near(self, law: PlaneLaw, fixed: Tensor, known: "Solution") -> "Solution | None":
         """Compute the equilibrium of another law under the same prescribed displacements, with the stiffness of a known one.
@@ -273,18 +301,19 @@ class PlaneSpecimen:
 
     def _forces(self, law: "PlaneLaw | SpatialLaw", u: Tensor) -> Tensor:
         """Return the internal force of each degree of freedom [N], (2 N,), differentiable."""
-        F = self.gradient(u)
-        whole = self.whole(law, F.detach())
-        if self.condition == "stress":
-            slope = law.across(whole)[1]
-            whole = torch.cat([F, whole[:, 4:]], 1)
-            whole = torch.cat([F, (whole[:, 4] - law.stress(whole)[:, 4] / slope)[:, None]], 1)  # carries the derivative
-        else:
-            whole = torch.cat([F, whole[:, 4:]], 1)
-        P = law.stress(whole)[:, :4].reshape(-1, 2, 2)
+        P = law.stress(self._whole_derived(law, self.gradient(u)))[:, :4].reshape(-1, 2, 2)
         volume = self.thickness * self.areas  # type: ignore[attr-defined]
         each = volume[:, None, None] * self._slopes @ P.mT  # type: ignore[attr-defined]
         return torch.zeros_like(u).index_add(0, self.triangles.reshape(-1), each.reshape(-1, 2)).reshape(-1)
+
+    def _whole_derived(self, law: "PlaneLaw | SpatialLaw", F: Tensor) -> Tensor:
+        """Return `whole` with its derivatives by F and by the law."""
+        whole = self.whole(law, F.detach())
+        if self.condition == "strain":
+            return torch.cat([F, whole[:, 4:]], 1)
+        slope = law.across(whole)[1]
+        whole = torch.cat([F, whole[:, 4:]], 1)
+        return torch.cat([F, (whole[:, 4] - law.stress(whole)[:, 4] / slope)[:, None]], 1)
 
     def _spread(self, P: Tensor) -> Tensor:
         """Return the force of each degree of freedom (2 N,) [N] of stresses (E, 4) [Pa]."""
@@ -306,6 +335,12 @@ class PlaneSpecimen:
         size = 2 * len(self.nodes)
         matrix = coo_matrix((K.reshape(-1).numpy(), (rows.reshape(-1).numpy(), columns.reshape(-1).numpy())), shape=(size, size))
         return self._spread(P[:, :4]), matrix.tocsc()
+
+
+def parts_of(law: "PlaneLaw | SpatialLaw") -> tuple[float, ...]:
+    """Return the shares of a load step after each of which the plastic strain is kept; a law that does not yield takes one."""
+    count = PARTS if isinstance(law, PlaneLaw) and law.yields else 1
+    return tuple((i + 1) / count for i in range(count))
 
 
 class Factor:

@@ -90,6 +90,10 @@ CASES = {
     "volumetric term": ({}, declared("neo_hookean"), "volumetric"),
     "linear elasticity": ({}, declared("linear"), "geometric_nonlinearity"),
     "without stiffening": ({"strain_stiffening.k": 0.3}, declared(), "strain_stiffening"),
+    "without yield": ({"yield.inverse": 2e-6}, declared(), "yield"),
+    "without the second invariant": ({"second_invariant.c": 0.5}, declared(), "second_invariant"),
+    "without a fibre": ({"fibre.c": 1e6, "fibre.elevation": 0.5}, declared(), "fibre"),
+    "one stiffness": ({"stiffness_gradient.x": 0.6, "stiffness_gradient.y": -0.3}, declared(), "stiffness_gradient"),
 }
 
 

@@ -17,6 +17,7 @@ PRESENT = {
     "volumetric": {"volumetric.share": 0.4}, "geometric_nonlinearity": {"geometric_nonlinearity.share": 0.6},
     "strain_stiffening": {"strain_stiffening.k": 0.3}, "second_invariant": {"second_invariant.c": 0.4},
     "fibre": {"fibre.c": 0.8, "fibre.elevation": 0.6}, "stiffness_gradient": {"stiffness_gradient.x": 0.5, "stiffness_gradient.y": -0.3},
+    "yield": {"yield.inverse": 4.0},
 }  # fmt: skip
 
 
@@ -86,11 +87,63 @@ def test_an_effect_is_absent_at_zero_and_its_gradient_is_that_of_finite_differen
     if effect != "stiffness_gradient":
         without = own.equilibrium(PlaneLaw(law), fixed, motion)
         assert float(energy(0.0)) == pytest.approx(float((without.displacement * motion).sum() + (without.force * motion).sum()), rel=1e-9)
-    for at in (0.0, value):
+    for at in (value,) if effect == "yield" else (0.0, value):  # a yield stress without bound has no slope
         size = torch.tensor(at, dtype=torch.float64, requires_grad=True)
         (grad,) = torch.autograd.grad(energy(size), size)
         low = max(at - 1e-5, 0.0) if effect == "geometric_nonlinearity" else at - 1e-5
         assert float(grad) == pytest.approx(float(energy(at + 1e-5) - energy(low)) / (at + 1e-5 - low), rel=1e-4, abs=1e-7)
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "fixed_corotated", "sigma"])
+def test_yield_along_a_path_is_that_of_three_dimensions(law):
+    """Loading, turning and reversal: the same stress as the law of a simulated body, which takes the exponential of a matrix."""
+    effects = {"yield.inverse": 1.5}
+    own, ends = PlaneLaw(LAW | {"law": law}, effects), gradients()
+    twin = Constitutive(*material(LAW | {"law": law}), Effects.of(effects), count=len(ends))
+    here, history, still = torch.eye(3, dtype=torch.float64).expand(len(ends), 3, 3), twin.start(), torch.zeros(len(ends), 3, 3).double()
+    rest, last = torch.tensor([1.0, 0, 0, 1, 1], dtype=torch.float64), None
+    for share in (0.3, 0.6, 1.0, 0.4, -0.2):
+        F = rest + share * (ends - rest)
+        whole = torch.zeros(len(F), 3, 3, dtype=torch.float64)
+        for i, (row, column) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (2, 2)]):
+            whole[:, row, column] = F[:, i]
+        step = whole if last is None else whole @ torch.linalg.inv(last)
+        here, history = twin.advance(step @ here, still, history, 1.0)
+        P = torch.linalg.solve(whole, twin.stress(here, still, history).mT).mT
+        wanted = torch.stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 0], P[:, 1, 1], P[:, 2, 2]], 1)
+        torch.testing.assert_close(own.stress(F), wanted, atol=1e-8, rtol=1e-7)
+        own, last = own.after(F), whole
+    assert float((own.plastic - rest).abs().max()) > 0.05
+
+
+def test_a_strip_yields_at_its_stress_and_keeps_a_set():
+    """Uniaxial tension of a thin strip: |dev tau| = Y is tau_11 = sqrt(3/2) Y; unloaded, its length is that of the plastic stretch.
+
+    Two triangles, because a longer strip without hardening may neck anywhere.
+    """
+    own = sheet(1, condition="stress")
+    young, limit = LAW["young"], 0.2
+    law = PlaneLaw(LAW | {"law": "sigma"}, {"yield.inverse": 1 / limit})
+    tau = math.sqrt(1.5) * limit
+    back = 1.3 * math.exp(-1.5 * tau / young)  # half of the yield stress beyond the stretch that is left without a force
+    fixed, motion = pulled(own, [1.02, 1.3, back])
+    found = own.equilibrium(law, fixed, motion)
+    force = found.force[:, own.nodes[:, 0] == 1, 0].sum(1) / own.thickness
+    wanted = torch.tensor([young * math.log(1.02) / 1.02, tau / 1.3, -0.5 * tau / back], dtype=torch.float64)
+    torch.testing.assert_close(force, wanted, atol=1e-8, rtol=1e-8)
+
+
+def test_parts_of_a_load_step_change_little():
+    """A plate whose field is not uniform, followed in 4 and in 16 parts."""
+    own = sheet(3)
+    fixed, motion = pulled(own, [1.2, 1.1])
+    fixed[own.nodes[:, 0] == 1, 1] = True
+    law = PlaneLaw(LAW, {"yield.inverse": 5.0})
+    plain, whole = own.equilibrium(PlaneLaw(LAW), fixed, motion), own.equilibrium(law, fixed, motion)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neuido.physics.plane.plane_specimen.PARTS", 16)
+        fine = own.equilibrium(law, fixed, motion)
+    assert float((whole.force - fine.force).abs().max()) < 0.02 * float((whole.force - plain.force).abs().max())
 
 
 def test_the_stiffness_of_another_law_serves():

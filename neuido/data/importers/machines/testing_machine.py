@@ -9,7 +9,7 @@ import numpy as np
 from neuido.data.files.delimited import is_number
 from neuido.data.importers.tables.titled_tables import LONGEST_TITLE, Table
 from neuido.data.importers.tables.titles import bare_title, find_columns
-from neuido.data.importers.tables.units import conversion_factor, parse_quantity
+from neuido.data.importers.tables.units import conversion_factor, measures, parse_quantity
 from neuido.errors import UserError
 
 MODES = ("uniaxial", "compression", "equibiaxial", "pure_shear", "biaxial", "simple_shear")
@@ -19,6 +19,8 @@ _SIZES = {"length": r".*gau?ge length|.*(specimen|sample) (length|height)|length
           "diameter": r"(\w+ )?diameter|durchmesser|diam.tre|di.metro",
           "area": r".*cross[- ]?section\w*( area)?|(specimen |initial )?area|.*querschnitt\w*|section initiale|.rea"}  # fmt: skip
 _COMPRESSED = re.compile(r"compress|stauch|druck", re.IGNORECASE)
+UNEQUAL = 0.02
+"""Difference of a stress column and the force over the cross-section, relative, that is said: sizes are measured to a per cent or so."""
 LARGEST_RATIO = 3.0
 """Largest strain that is taken for a ratio where no unit is given; 300 % and more is rubber in tension."""
 
@@ -119,15 +121,35 @@ class MachineTable:
             raise UserError(f"{self.name} {why}: give its {name}, for example --{name} '{50 if name == 'length' else 2} mm'")
         return self.sizes[name]
 
+    def known_area(self) -> float | None:
+        """Return the cross-section of the specimen [m^2]; None where it is not known."""
+        if "area" in self.sizes:
+            return self.sizes["area"]
+        if "diameter" in self.sizes:
+            return np.pi / 4 * self.sizes["diameter"] ** 2
+        return self.sizes["width"] * self.sizes["thickness"] if {"width", "thickness"} <= self.sizes.keys() else None
+
+    def compare_force(self, stress: np.ndarray) -> None:
+        """Say it where a column of forces, over the cross-section, is not the column of nominal stresses [Pa], (n,), that is used."""
+        area = self.known_area()
+        unit = self.units.get("force") or (self.table.units[self.found["force"]] if "force" in self.found else "")
+        if area is None or not unit or not measures(unit, "N"):
+            return
+        force = self._measured(self.found["force"]) * conversion_factor(unit, "N", f"{self.name}, --units.force")
+        both = np.isfinite(force) & np.isfinite(stress)
+        if not both.any() or not (size := float(stress[both] @ stress[both])):
+            return
+        ratio = abs(float(force[both] @ stress[both])) / (area * size)
+        if abs(ratio - 1) > UNEQUAL:
+            self.summary.append(
+                f"odd: column {self.title('force')!r} over the cross-section of {1e6 * area:g} mm^2 is {ratio:.3g} times column "
+                f"{self.title('nominal_stress')!r}, which is used: check the cross-section (--columns.nominal_stress names another)"
+            )
+
     def area(self) -> float:
         """Return the cross-section of the specimen [m^2]."""
-        if "area" in self.sizes:
-            out = self.sizes["area"]
-        elif "diameter" in self.sizes:
-            out = np.pi / 4 * self.sizes["diameter"] ** 2
-        elif "width" in self.sizes and "thickness" in self.sizes:
-            out = self.sizes["width"] * self.sizes["thickness"]
-        else:
+        out = self.known_area()
+        if out is None:
             raise UserError(
                 f"{self.name} has a force: give the cross-section, --area '20 mm^2', --width '10 mm' --thickness '2 mm' or "
                 "--section_diameter '10 mm'"
@@ -210,6 +232,8 @@ def _one_axis(given: MachineTable, mode: str, compression: bool) -> dict[str, np
         given.summary.append("nominal stress = stretch times second Piola-Kirchhoff stress")
     else:
         out[stress] = given.column(stress, "Pa")
+        if stress == "nominal_stress":
+            given.compare_force(out[stress])
     sources = (given.title(path), given.title(stress))
     if mode == "compression" or (not compression and any(_COMPRESSED.search(title) for title in sources)):
         _make_compression(out, given, stated=mode != "compression")

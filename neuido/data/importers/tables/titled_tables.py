@@ -66,7 +66,7 @@ def _sheets(path: Path) -> tuple[dict[str, list[list[str]]], list[str]]:
         sheets = read_spreadsheet(path)
         return {name: with_units_above(rows, LEAST_ROWS, path.name) for name, rows in sheets.items()}, []
     table = read_delimited(path)
-    names = {"\t": "tabs", " ": "blanks", ",": "commas", ";": "semicolons"}
+    names = {"\t": "tabs", " ": "blanks", ",": "commas", ";": "semicolons", "|": "bars"}
     notes = [f"{names[table.separator]} between columns", f"encoding {table.encoding}"]
     return {"": with_units_above(table.rows, LEAST_ROWS, path.name)}, [*notes, "decimal commas"] if table.decimal == "," else notes
 

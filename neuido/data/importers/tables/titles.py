@@ -53,14 +53,14 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "shear": r"shear strain|amount of shear|shear|scherung|gleitung|gamma|γ|cisaillement|distorsi.n",
     "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ|.*contrainte.*|.*esfuerzo.*|tensión.*",
     "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ|.longation relative",
-    "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*déformation.*|deformación.*",
+    "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*verformung.*|.*déformation.*|deformación.*",
     "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
     "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|"
     r"verl.ngerung|distance$|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
     r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub",
     "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
     "frame": r"frames?( ?#)?|frame[ _]?(idx|index|no\.?|nr\.?|number|id)|"
-    r"(video )?bild(nummer|nr)?|image( ?(no|nr|number)\.?)?|slice|trame|fotograma",
+    r"(video )?bild(nummer|nr)?|image( ?(no|nr|number)\.?)?|slice|trame|fotograma|index|idx",
     "recording": r"recording|take|trial|run|experiment|clip|video|sequence|throw|"
     r"aufnahme|durchgang|versuch|wurf|messung|essai|prise|toma|ensayo",
     "id": r"(particle|marker|point|track|object|node|label)?[ _-]?(id|label)|particle|marker|point|track|node|object|bead|"

@@ -12,6 +12,7 @@ from neuido.physics.effects.library import LIBRARY
 STAGES = {
     "volumetric": "change of the volume", "geometric_nonlinearity": "large deformation", "strain_stiffening": "large strain",
     "second_invariant": "biaxiality", "fibre": "direction", "stiffness_gradient": "place",
+    "yield": "large strain and reversal",
 }  # fmt: skip
 """Stage in which each effect shows."""
 LARGE = 0.02
@@ -32,7 +33,7 @@ def plane_candidates(experiment: PlaneExperiment) -> tuple[tuple[Candidate, ...]
 
     def add(
         name: str, starts: Sequence[dict[str, float]], *parameters: tuple[str, float, float, float], sizes: str = "", linear: bool = True,
-        needs: str = "", saturates: bool = False, form: str = "",
+        needs: str = "", saturates: bool = False, form: str = "", log: str = "",
     ) -> None:  # fmt: skip
         """Add a candidate with parameters (name, typical step, lower, upper); see `material_candidates`."""
         units = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
@@ -40,7 +41,7 @@ def plane_candidates(experiment: PlaneExperiment) -> tuple[tuple[Candidate, ...]
         for key, scale, lower, upper in parameters:
             value = experiment.effects.get(f"{name}.{key}", starts[0][key] if sizes and key not in sizes.split() else 0.0)
             bounds = min(lower, value), max(upper, value)
-            made.append(Parameter(f"{name}.{key}", units[key], value, scale, *bounds, saturates=saturates))
+            made.append(Parameter(f"{name}.{key}", units[key], value, scale, *bounds, log=key in log.split(), saturates=saturates))
         points = tuple({f"{name}.{key}": float(value) for key, value in start.items()} for start in starts)
         own = tuple(f"{name}.{key}" for key in sizes.split())
         found.append(Candidate(name, tuple(made), points, STAGES[name], form=form, sizes=own, linear=linear, needs=needs))
@@ -58,6 +59,9 @@ def plane_candidates(experiment: PlaneExperiment) -> tuple[tuple[Candidate, ...]
     add("fibre", [{"c": 0.3 * mu, "elevation": float(a)} for a in angles], ("c", 0.2 * mu, 0.0, 30 * mu),
         ("elevation", 0.2, -2 * np.pi, 2 * np.pi), sizes="c")  # fmt: skip
     add("stiffness_gradient", [{"x": 0.3, "y": 0.3}], ("x", 0.3, -5.0, 5.0), ("y", 0.3, -5.0, 5.0), form="gradient")
+    norm = 2 * mu * (reach / 2) ** 0.5  # I1 - 3 is twice the square of the deviator of a small strain
+    add("yield", [{"inverse": f / norm} for f in (1.1, 1.5, 3.0, 10.0)], ("inverse", 0.3, 1e-3 / norm, 100 / norm),
+        sizes="inverse", linear=False, log="inverse")  # fmt: skip
     return tuple(found), excluded
 
 

@@ -56,15 +56,15 @@ class PlaneProblem(Problem):
         for recording in experiment.recordings:
             sigma = recording.displacement_noise or displacement_noise(experiment, recording)
             scale = sigma / force_noise(recording)
-            steps, u = [], torch.zeros_like(experiment.specimen.nodes)
+            steps, u, own = [], torch.zeros_like(experiment.specimen.nodes), law
             for t in range(len(recording.displacement)):
                 motion = prescribed_motion(experiment, recording, t)
                 try:
-                    known = experiment.specimen.towards(law, fixed, u, motion, t)
+                    known, before, own = experiment.specimen.followed(own, fixed, u, motion, t)
                 except UserError as error:
                     raise UserError(f"{experiment.folder / 'plane.yaml'}: {recording.name}: {error}") from error
                 u = known.displacement
-                steps.append(self._step(recording, t, motion, fixed, known, law, sigma, scale))
+                steps.append(self._step(recording, t, motion, fixed, known, before, sigma, scale))
             self._steps.append(steps)
             self._forces_scale.append(scale)
             y = np.concatenate([self._seen(recording.displacement[t], recording.force[t], step, scale) for t, step in enumerate(steps)])
@@ -161,12 +161,17 @@ class PlaneProblem(Problem):
         try:
             law = self._law(point)
             found: list[Solution] = []
+            start = torch.zeros_like(own.nodes)
             for t, step in enumerate(steps):
+                if law.yields:
+                    near, _, law = own.followed(law, fixed, start, step.motion, t)
+                    start = near.displacement
+                    found.append(near)
+                    continue
                 near = None if before is None else own.near(law, fixed, before[t])
                 near = near or own.near(law, fixed, step.known)
                 if near is None:
-                    start = found[-1].displacement if found else torch.zeros_like(own.nodes)
-                    near = own.towards(law, fixed, start, step.motion, t)
+                    near = own.towards(law, fixed, found[-1].displacement if found else start, step.motion, t)
                 found.append(near)
         except UserError:
             return None
