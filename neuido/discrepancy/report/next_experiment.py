@@ -53,8 +53,10 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, setting)
     elif hasattr(inner, "tests"):
         catalogue = _materials(inner)
-    else:
+    elif hasattr(inner, "tracks"):
         catalogue = _tracks(inner)
+    else:  # a plane specimen: no other loading is simulated
+        return None
     first = []
     for name, problem, sigma in catalogue:
         if d.budget.skips("the next experiment"):
