@@ -22,6 +22,9 @@ import rollout  # noqa: E402
 import room  # noqa: E402
 import scaling  # noqa: E402
 import waits  # noqa: E402
+from peers import Problem  # noqa: E402
+from peers.engine import Engine  # noqa: E402
+from peers.loops import MasivLike, NeumaLike  # noqa: E402
 
 
 def simulator(friction: float, dt: float = 1e-3) -> Simulator:
@@ -49,6 +52,21 @@ def test_plain_rollout_is_the_same_physics(friction):
 def test_plain_rollout_refuses_what_it_does_not_do():
     with pytest.raises(UserError, match="plain rollout"):
         plain.Transfers(simulator(0.3))
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "networks"])
+def test_loops_of_others_solve_the_common_problem(law):
+    problem = Problem(12, 20, law)
+    own, *others = (kind(problem, "cpu") for kind in (Engine, NeumaLike, MasivLike))
+    start = torch.from_numpy(problem.arrays()[0])
+    for peer in (own, *others):
+        peer.forward()
+        peer.gradient()
+    moved = torch.from_numpy(own.positions()) - start
+    assert moved.abs().max() > 1e-3
+    for peer in others:
+        assert (torch.from_numpy(peer.positions() - own.positions())).norm() < 1e-4 * moved.norm()
+        assert (torch.from_numpy(peer.slopes() - own.slopes())).norm() < 1e-3 * torch.from_numpy(own.slopes()).norm()
 
 
 def test_floor():
