@@ -61,11 +61,16 @@ def no_process_stays():
             process.communicate()
 
 
+def heed_signals() -> None:
+    """Undo what is inherited: background jobs of a shell ignore SIGINT, and commands of nohup SIGHUP."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def begin(folder: Path, *args: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "neuido", *args]
     pipe = subprocess.PIPE
-    heeds = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (a shell's background jobs ignore it)
-    BEGUN.append(subprocess.Popen(command, cwd=folder, stderr=pipe, stdout=pipe, text=True, preexec_fn=heeds))
+    BEGUN.append(subprocess.Popen(command, cwd=folder, stderr=pipe, stdout=pipe, text=True, preexec_fn=heed_signals))
     return BEGUN[-1]
 
 
