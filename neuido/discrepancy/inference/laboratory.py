@@ -215,8 +215,7 @@ class Laboratory:
             options: Further options of `levenberg_marquardt`.
         """
         margin = functools.partial(self.problem.margin, setting=self.setting)
-        # slopes are carried where motions are simulated, on a GPU too: there as well, other fits and lanes wait for what a launch does
-        together = self.problem.together and self.problem.settings == 1
+        together = self.problem.together
         return levenberg_marquardt(parameters, start, together=together, margin=margin, halt=lambda: self.budget.ends(until), **options)
 
     def runs(self, point: Point) -> bool:

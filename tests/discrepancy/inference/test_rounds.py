@@ -1922,14 +1922,3 @@ def test_a_look_that_is_late_tries_no_further_sizes(together, monkeypatch):
     assert set(least) == {"clip"} and [entry for entry in kept if entry[0] is by_key["cube"]] == starts[1:]
     clock[0] = 0.0
     assert set(contests.sized(search.lab, starts, base.fit, slopes, base.floor, until=0.9)[1]) == {"clip", "cube"}
-
-
-def test_a_fit_of_motions_is_the_same_where_simulations_share_a_launch():
-    fits = []
-    for together in (False, True):
-        problem = Line(clipped, together=together)
-        lab = Laboratory(problem)
-        clip = next(c for c in problem.candidates if c.key == "clip")
-        fits += lab.fits([lab.request((*problem.declared, *clip.parameters), {"a": 2.0, **clip.starts[1]})], lab.noise())
-    assert fits[0].evaluations == fits[1].evaluations > 4
-    assert fits[0].point == fits[1].point
