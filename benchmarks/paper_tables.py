@@ -197,7 +197,8 @@ def page() -> str:
             unseen(rows_of(RESULTS / "stage2_ten_bounded.csv")),
         ),
         "## Figure 6: transfer to other conditions\n\nAnother velocity, another shape, two bodies in contact:\n"
-        "`neuido predict --config configs/experiments/transfer.yaml` writes the videos. The paper gives no figures. Ours, eight moments of each:\n\n"
+        "`neuido predict --config configs/experiments/transfer.yaml` writes the videos. The paper gives no figures. "
+        "Ours, eight moments of each:\n\n"
         "![The ball thrown, a cube of its material, and a ball of it on a box of the cat's clay](transfer.png)\n\n"
         "## Figure 7: the latents\n\nt-SNE and interpolation are on [the page of the latents](latents.md): "
         "`neuido latents --config configs/experiments/latent_space.yaml`.\n\n"

@@ -93,12 +93,16 @@ def _line_of(error: BaseException) -> str | None:
         return f"there is not enough memory{detail}: end what else runs here, or ask for less (fewer particles, cells, views or draws)"
     if _NOT_WRITTEN.search(str(error)):
         return "No space left on device: what was being written is not there under its name; free some space, or give another out"
+    if isinstance(error, RuntimeError) and _LOST_PEER.search(str(error)):
+        return "another process of this training has ended, and says why where it ran; --ckpt_path goes on from the last checkpoint"
     if isinstance(error, pickle.UnpicklingError):
         return "the checkpoint cannot be read weights-only: it is damaged, or holds objects that reading would execute"
     if isinstance(error, OSError) or type(error).__name__ == "MisconfigurationException":
         return str(error)
     return None
 
+
+_LOST_PEER = re.compile(r"gloo.*(Connection closed|reset by peer|Broken pipe)|NCCL.*(remote process|peer)", re.DOTALL)
 
 _NOISE = re.compile(  # lines of jsonargparse's messages without information for a user
     r"Does not validate|Subtypes:|Errors:|Given value type:|Given value: (Nest|Name|[{\[])|Expected a (<class 'None|path but)|$"

@@ -110,6 +110,13 @@ def stop_at_step(path: Path | None = None) -> "Callback":
     return StopAtStep()
 
 
+def log_folder(trainer: Any) -> str | None:
+    """Return the folder of the first logger; `Trainer.log_dir` waits for all processes of a training, of which others may have ended."""
+    if not trainer.loggers:
+        return None
+    return getattr(trainer.loggers[0], "log_dir", None) or trainer.loggers[0].save_dir
+
+
 def _place(trainer: Any) -> Path:
     folder = getattr(trainer.checkpoint_callback, "dirpath", None)
-    return Path(folder or trainer.log_dir or trainer.default_root_dir)
+    return Path(folder or log_folder(trainer) or trainer.default_root_dir)

@@ -191,11 +191,11 @@ def _summary(cli: "LightningCLI", command: str) -> list[str]:
     more = f" and {len(metrics) - METRICS} more" if len(metrics) > METRICS else ""
     lines = [f"last metrics: {', '.join(metrics[:METRICS])}{more}"] if metrics else []
     saved = getattr(trainer.checkpoint_callback, "best_model_path", "") or getattr(trainer.checkpoint_callback, "last_model_path", "")
-    weights = cli.model.hparams.get("save_to")
+    weights, log = cli.model.hparams.get("save_to"), interruption.log_folder(trainer)
     places = {
         "tables and fits": _results_folder(cli, command),
         "weights": weights if command == "fit" and weights and Path(weights).exists() else None,
-        "log": trainer.log_dir if trainer.loggers and trainer.log_dir and Path(trainer.log_dir).exists() else None,
+        "log": log if log and Path(log).exists() else None,
         "checkpoint": saved if command == "fit" and saved else None,
     }
     found = [(what, place) for what, place in places.items() if place]
