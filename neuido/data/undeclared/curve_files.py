@@ -14,11 +14,11 @@ from neuido.data.undeclared.sizing import rms, rounded_to_4, scale_to_separation
 
 Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
 """For each effect: initial values, names of the parameters to scale, and the smallest and largest scale factor."""
+PAIR = 0.2
+"""Share of pairs among the cases with an effect."""
 
 
-def drawn_effect(
-    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
-) -> Drawn | None:
+def drawn_effect(kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]) -> Drawn | None:
     """Return an effect that moves the data by about `target` times the noise; None for `none`."""
     if kind == "none":
         return None
@@ -30,12 +30,15 @@ def drawn_effect(
     return found.rounded()
 
 
-def drawn_effects(
-    rng: np.random.Generator, kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]
-) -> list[Drawn]:
+def drawn_effects(kind: str, sizes: Sizes, target: float, noise: float, separation: Callable[[Mapping[str, float]], float]) -> list[Drawn]:
     """Return the effects of a kind, two for "first+second", each of which alone moves the data by about `target` times the noise."""
-    found = [drawn_effect(rng, one, sizes, target, noise, separation) for one in kind.split("+")]
+    found = [drawn_effect(one, sizes, target, noise, separation) for one in kind.split("+")]
     return [one for one in found if one is not None]
+
+
+def values_of(drawn: Sequence[Drawn]) -> dict[str, float]:
+    """Return the parameters of all effects."""
+    return {name: value for one in drawn for name, value in one.values.items()}
 
 
 def outside_entry(drawn: Drawn, meaning: str, units: Mapping[str, str], near: tuple[str, ...]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import yaml
 from neuido.data.files.writing import write_text
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.curve_files import Sizes, drawn_effects, key_rows, outside_entry, write_csv, write_tests
+from neuido.data.undeclared.curve_files import PAIR, Sizes, drawn_effects, key_rows, outside_entry, values_of, write_csv, write_tests
 from neuido.data.undeclared.laboratory_tests import form_of
 from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth_entry
 from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4
@@ -36,8 +36,8 @@ TEST_PAIRS = ("viscosity_shear+strain_stiffening", "maxwell+mullins", "hysteresi
 TRACK_PAIRS = ("drag_quadratic+uniform_acceleration", "drag_linear+magnus", "gravity+drag_quadratic", "drag_quadratic+magnus")
 TEST_OUTSIDE, TRACK_OUTSIDE = ("swinging_stiffness",), ("dry_drag",)
 """Effects that the library cannot express in a test or in a free flight."""
-PAIR, OUTSIDE = 0.2, 0.1
-"""Shares of pairs and of effects outside the library among the cases with an effect."""
+OUTSIDE = 0.1
+"""Share of effects outside the library among the cases with an effect."""
 PERIOD = 2.0
 """Period of the loading of a specimen [s]."""
 SWING = 0.37
@@ -122,8 +122,8 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
     noise = 3e-3 * max(float(np.abs(one).max()) for one in plain)
     flow = plasticity.get("yield_stress", young)
     sizes = _test_sizes(rng, young, flow)
-    drawn = drawn_effects(rng, kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
-    true = stresses(_values(drawn)) if drawn else plain
+    drawn = drawn_effects(kind, sizes, ratio * noise, noise, lambda values: rms(stresses(values)[0] - plain[0]))
+    true = stresses(values_of(drawn)) if drawn else plain
     declared = float(f"{young * (rng.uniform(0.65, 0.85) if rng.random() < 0.5 else rng.uniform(1.2, 1.5)):.3g}")
     free = ["young", "yield_stress"] if plastic == PLASTIC and rng.random() < 0.5 else ["young"]
     start = {"young": declared} | ({"yield_stress": float(f"{1.3 * flow:.3g}")} if len(free) > 1 else {})
@@ -149,11 +149,6 @@ def _test(rng: np.random.Generator, kind: str, ratio: float, name: str, advance:
         "free": free,
     }
     return functools.partial(write_tests, name, model, tests), truth
-
-
-def _values(drawn: Sequence[Drawn]) -> dict[str, float]:
-    """Return the parameters of all effects."""
-    return {name: value for one in drawn for name, value in one.values.items()}
 
 
 def _entry(drawn: Drawn, free: tuple[str, ...] = ()) -> dict[str, Any]:
@@ -225,8 +220,8 @@ def _track(rng: np.random.Generator, kind: str, ratio: float, name: str, advance
 
     plain = paths({})
     sizes = _track_sizes(rng)
-    drawn = drawn_effects(rng, kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
-    true = paths(_values(drawn)) if drawn else plain
+    drawn = drawn_effects(kind, sizes, ratio * noise, noise, lambda values: rms((paths(values) - plain)[:2]))
+    true = paths(values_of(drawn)) if drawn else plain
     roles, names = ["fit", "fit", "held_out", "held_out"], [f"throw-{i + 1}" for i in range(count)]
     truth = {
         "undeclared": [_entry(one) for one in drawn],

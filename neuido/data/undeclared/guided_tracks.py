@@ -12,8 +12,9 @@ import yaml
 from neuido.data.files.writing import write_text
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
+from neuido.data.undeclared.curve_files import PAIR, drawn_effects, values_of
 from neuido.data.undeclared.random_effects import Drawn
-from neuido.data.undeclared.sizing import rms, rounded_to_4, scale_to_separation
+from neuido.data.undeclared.sizing import rms, rounded_to_4
 from neuido.errors import UserError
 from neuido.physics.effects.library import LIBRARY
 from neuido.physics.points.point_mass import Forces, fly
@@ -135,7 +136,7 @@ def guided_case(
             raise UserError(f"case.{option} = {getattr(case, option)} applies to bodies only: remove it, or give case.measured = body")
     if case.kind is not None and case.kind not in ("none", *KINDS, *PAIRS):
         raise UserError(f"case.kind = {case.kind!r} does not suit case.measured = guided: choose from none, {', '.join((*KINDS, *PAIRS))}")
-    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(list(KINDS if rng.random() < 0.8 else PAIRS))))
+    kind = case.kind or ("none" if rng.random() < 1 / 3 else str(rng.choice(list(KINDS if rng.random() < 1 - PAIR else PAIRS))))
     guide = str(rng.choice([g for g in GUIDES if g not in ("disc", "water")])) if kind == "none" else kind.partition(":")[0]
     made = GUIDES[guide](rng)
     fps = float(rng.choice([60.0, 100.0]))
@@ -155,14 +156,11 @@ def guided_case(
 
     plain = seen({})
     noise = float(f"{rng.uniform(1.0, 3.0) * 1e-3 * (np.ptp(plain) if guide in ('spring', 'axis') else 1.0):.3g}")
-    drawn: list[Drawn] = []
     ratio = case.separation or float(np.exp(rng.uniform(np.log(20.0), np.log(80.0))))
-    for effect in () if kind == "none" else (KINDS | PAIRS)[kind].split("+"):
-        values, size = _sizes(rng, made, effect)
-        named = {f"{effect}.{key}": value for key, value in values.items()}
-        one = Drawn(effect, named, tuple(f"{effect}.{key}" for key in size.split()), 1e-4, 100.0)
-        drawn.append(scale_to_separation(one, ratio * noise, lambda own: rms((seen(own.values) - plain)[:2]), 16 * noise).rounded())
-    true = seen({name: value for one in drawn for name, value in one.values.items()}) if drawn else plain
+    effects = {"none": "none", **KINDS, **PAIRS}[kind]
+    sizes = {effect: (*_sizes(rng, made, effect), 1e-4, 100.0) for effect in effects.split("+") if effect != "none"}
+    drawn = drawn_effects(effects, sizes, ratio * noise, noise, lambda values: rms((seen(values) - plain)[:2]))
+    true = seen(values_of(drawn)) if drawn else plain
     roles, names = ("fit", "fit", "held_out"), ("run-1", "run-2", "run-3")
     rows = [
         {"name": n, "role": r, "separation_over_noise": rounded_to_4(rms(a - b) / noise)} for n, r, a, b in zip(names, roles, true, plain)

@@ -61,7 +61,7 @@ def fluid_curves(rng: np.random.Generator, kind: str, ratio: float, name: str, a
         return [np.log(flow_stress(np.array([viscosity]), given, *own)[0]) for own in zip(rates, times, strict=True)]
 
     plain = stresses({})
-    drawn = drawn_effect(rng, kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(stresses(values)[0] - plain[0]))
+    drawn = drawn_effect(kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(stresses(values)[0] - plain[0]))
     true = stresses(drawn.values) if drawn else plain
     names, roles = ["curve", "again"], ["fit", "held_out"]
     truth = {
@@ -105,7 +105,7 @@ def oscillation(rng: np.random.Generator, kind: str, ratio: float, name: str, ad
         return [np.log(complex_modulus(specimen, torch.from_numpy(w))[0].numpy()) for w in sweeps]
 
     plain = moduli({})
-    drawn = drawn_effect(rng, kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(moduli(values)[0] - plain[0]))
+    drawn = drawn_effect(kind, sizes, ratio * RELATIVE, RELATIVE, lambda values: rms(moduli(values)[0] - plain[0]))
     true = moduli(drawn.values) if drawn else plain
     names, roles = ["sweep", "again"], ["fit", "held_out"]
     truth = {
@@ -154,7 +154,7 @@ def creep_test(rng: np.random.Generator, kind: str, ratio: float, name: str, adv
 
     plain = strains({})
     noise = STRAIN * max(float(np.abs(one).max()) for one in plain)
-    drawn = drawn_effect(rng, kind, sizes, ratio * noise, noise, lambda values: rms(strains(values)[0] - plain[0]))
+    drawn = drawn_effect(kind, sizes, ratio * noise, noise, lambda values: rms(strains(values)[0] - plain[0]))
     true = strains(drawn.values) if drawn else plain
     names, roles = ["low", "high", "between"], ["fit", "fit", "held_out"]
     truth = {
