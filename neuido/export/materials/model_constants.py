@@ -25,6 +25,7 @@ from neuido.data.measured.experiment import read_model
 from neuido.errors import UserError, suggest
 from neuido.physics.effects.coefficients import hysteresis_spectrum
 from neuido.physics.effects.parameters import LIBRARY
+from neuido.physics.laws.parametric import young_poisson
 
 ROOT = math.sqrt(1.5)
 MODEL_FILES = ("model_after.yaml", "experiment.yaml", "test.yaml", "scene.yaml")
@@ -110,8 +111,7 @@ class Constants:
     @property
     def instantaneous(self) -> tuple[float, float]:
         """Young's modulus [Pa] and Poisson's ratio [-] before any relaxation."""
-        G, K = self.mu * (1 + sum(g for g, _ in self.prony)), self.bulk
-        return 9 * K * G / (3 * K + G), (3 * K - 2 * G) / (2 * (3 * K + G))
+        return young_poisson(self.bulk, self.mu * (1 + sum(g for g, _ in self.prony)))
 
     def effect(self, name: str, key: str | None = None) -> float:
         """Return a parameter of an effect, zero where it is absent, and mark the effect as taken up."""

@@ -2,11 +2,7 @@
 
 from neuido.data.bodies.families import effects, laws
 from neuido.data.trajectories.reference_viscosity import reference_viscosity
-
-STRAIN = 1e-3
-"""Strain of the secants of E and nu [-]."""
-FLUID = 1e-3
-"""Ratio of shear to P-wave modulus below which a material is a fluid, without E and nu."""
+from neuido.physics.laws.parametric import young_poisson
 
 
 def properties_of(family: str, parameters: dict[str, float]) -> dict[str, float]:
@@ -17,7 +13,7 @@ def properties_of(family: str, parameters: dict[str, float]) -> dict[str, float]
     shear, bulk = (float(modulus) for modulus in laws(family, [parameters])[0].moduli())
     found = {}
     if shear > 0:  # else a fluid
-        found |= {"young": 9 * bulk * shear / (3 * bulk + shear), "poisson": (3 * bulk - 2 * shear) / (6 * bulk + 2 * shear)}
+        found["young"], found["poisson"] = young_poisson(bulk, shear)
     found |= {name: parameters[name] for name in ("yield_stress", "friction_angle") if name in parameters}
     viscosity = effective_viscosity(family, parameters)
     return found | ({"viscosity": viscosity} if viscosity > 0 else {})

@@ -28,6 +28,11 @@ def lame(young: Tensor, poisson: Tensor) -> tuple[Tensor, Tensor]:
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
+def young_poisson(bulk: float, shear: float) -> tuple[float, float]:
+    """Convert bulk and shear modulus [Pa] to Young's modulus [Pa] and Poisson's ratio [-]."""
+    return 9 * bulk * shear / (3 * bulk + shear), (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear))
+
+
 # the open interval in which each parameter must lie, and its unit
 _RANGES = {
     "young": (0.0, math.inf, " Pa"),
