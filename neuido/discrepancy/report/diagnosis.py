@@ -323,7 +323,7 @@ def _field(ax: Any, arrays: Mapping[str, Any], content: Mapping[str, Any], units
     size = factor * np.linalg.norm((arrays["moved_measured"] - arrays[f"moved_{when}"])[-1], axis=1)
     triangles = arrays["triangles"]
     unseen = np.isnan(size)[triangles].any(1)
-    shown = ax.tripcolor(*place.T, np.nan_to_num(size), triangles=triangles, mask=unseen, shading="gouraud")
+    shown = ax.tripcolor(*place.T, np.ma.masked_invalid(size), triangles=triangles, mask=unseen, shading="gouraud")
     ax.set(aspect="equal", xlabel=f"x [{unit}]", ylabel=f"y [{unit}]")
     ax.plot([], [], label=f"residual {when}")
     ax.figure.colorbar(shown, ax=ax, label=f"residual [{unit}]")

@@ -197,7 +197,7 @@ class WarmupModule(SteadyModule):
         viscosity = [effective_viscosity(entry["family"], entry["parameters"]) for entry in data.clips]
         return {
             "family": family,
-            "properties": properties.nan_to_num(),
+            "properties": properties.where(present, 0.0),  # no loss sees these
             "present": present.float(),
             "modulus": torch.stack(modulus),
             "viscosity": torch.tensor(viscosity),
