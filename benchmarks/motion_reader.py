@@ -332,8 +332,8 @@ def score(given: argparse.Namespace) -> None:
         row["seconds"] = time.perf_counter() - begun
         prepared = prepare(scene, None, device=device, graphs=False)
         read = {one.name: one.value for one in found.properties}
-        row |= unseen_scenes.motions(prepared, operator, latents[found.family](read).to(device), clip)
-        row |= unseen_scenes.moduli(operator, latents[found.family](read).to(device), clip)
+        z = latents[found.family](read).to(device)
+        row |= unseen_scenes.motions(prepared, operator, z, clip) | unseen_scenes.moduli(operator, z, clip)
         known = unseen_scenes.chamfer(prepared, operator, [latents[clip.family](truth).to(device)], 2)
         row["cd_properties"], row["cd_properties_ratio"] = known, known / row["cd_true"]
         rows.append(row)

@@ -161,18 +161,14 @@ class PlaneProblem(Problem):
         try:
             law = self._law(point)
             found: list[Solution] = []
-            start = torch.zeros_like(own.nodes)
             for t, step in enumerate(steps):
+                begun = found[-1].displacement if found else torch.zeros_like(own.nodes)
                 if law.yields:
-                    near, _, law = own.followed(law, fixed, start, step.motion, t)
-                    start = near.displacement
-                    found.append(near)
-                    continue
-                near = None if before is None else own.near(law, fixed, before[t])
-                near = near or own.near(law, fixed, step.known)
-                if near is None:
-                    near = own.towards(law, fixed, found[-1].displacement if found else start, step.motion, t)
-                found.append(near)
+                    solution, _, law = own.followed(law, fixed, begun, step.motion, t)
+                else:
+                    near = None if before is None else own.near(law, fixed, before[t])
+                    solution = near or own.near(law, fixed, step.known) or own.towards(law, fixed, begun, step.motion, t)
+                found.append(solution)
         except UserError:
             return None
         return found
