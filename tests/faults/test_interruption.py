@@ -18,6 +18,7 @@ from neuido.commands.cli.interruption import SIGNALS, received, stop_at_step, wa
 from neuido.commands.main import main
 from neuido.commands.sweep import sweep
 from neuido.data.sampling import FixedBatches, ResumableLoader
+from tests.small_fits import write_fit
 from tests.waiting import HANGS, wait_for
 
 FIT = {
@@ -41,13 +42,7 @@ BEGUN: list[subprocess.Popen] = []
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """A folder with small trajectories and the configuration of a fit that has no end by itself."""
-    folder = tmp_path_factory.mktemp("fit")
-    with pytest.raises(SystemExit) as stop:
-        main(["trajectories", "--out", str(folder / "trajectories"), "--instances=1", "--held_out=0",
-              "--setup.particles_per_side=3", "--setup.steps=40", "--device=cpu", "--progress=false"])  # fmt: skip
-    assert stop.value.code == 0
-    (folder / "fit.yaml").write_text(yaml.safe_dump(FIT))
-    return folder
+    return write_fit(tmp_path_factory.mktemp("fit"), FIT)
 
 
 @pytest.fixture(autouse=True)

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 from safetensors.torch import load_file
 
-from neuido.commands.main import main
+from tests.small_fits import write_fit
 from tests.waiting import HANGS, wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -39,12 +38,7 @@ FIT = {
 
 @pytest.fixture
 def folder(tmp_path):
-    with pytest.raises(SystemExit) as stop:
-        main(["trajectories", "--out", str(tmp_path / "trajectories"), "--instances=1", "--held_out=0",
-              "--setup.particles_per_side=3", "--setup.steps=40", "--device=cpu", "--progress=false"])  # fmt: skip
-    assert stop.value.code == 0
-    (tmp_path / "fit.yaml").write_text(yaml.safe_dump(FIT))
-    return tmp_path
+    return write_fit(tmp_path, FIT)
 
 
 def begin(folder: Path, *command: str) -> subprocess.Popen:
