@@ -229,7 +229,8 @@ def _read_array(archive: zipfile.ZipFile, member: str, path: Path, what: str) ->
         raise UserError(f"{path} is not a valid {what}: {member} contains {dtype} and not numbers")
     check_limit(math.prod(shape), "NEUIDO_MAX_ARRAY_ELEMENTS", f"{path}: {member} has {math.prod(shape)} elements")
     with archive.open(member) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
+        array = np.lib.format.read_array(stream, allow_pickle=False)
+    return array.astype(dtype.newbyteorder("="), copy=False)  # torch takes no other byte order
 
 
 def _size_in_header(path: Path) -> tuple[int, int] | None:

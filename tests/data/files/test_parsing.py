@@ -8,6 +8,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from neuido.data.files.parsing import image_size, parser_errors, read_arrays, read_image, read_json, read_table, read_yaml
 from neuido.errors import UserError
@@ -129,6 +130,15 @@ def test_damaged_archives(tmp_path):
     assert (read_arrays(path, ["x"], ["y"])["x"] == np.arange(1000.0)).all()
     with pytest.raises(UserError, match="is missing"):
         read_arrays(tmp_path / "b.npz", ["x"])
+
+
+@pytest.mark.parametrize("kind", ["f8", "f4", "f2", "i4", "u2"])
+def test_arrays_of_another_byte_order_are_read_as_native_ones(tmp_path, kind):
+    given = np.arange(6).reshape(2, 3)
+    np.savez(tmp_path / "a.npz", x=given.astype(f">{kind}"), y=given.astype(f"<{kind}"))
+    for array in read_arrays(tmp_path / "a.npz", ["x", "y"]).values():
+        assert array.dtype == np.dtype(kind) and array.dtype.isnative and np.array_equal(array, given)
+        assert torch.from_numpy(array.astype(np.float64, copy=False)).sum() == 15
 
 
 def test_images(tmp_path):
