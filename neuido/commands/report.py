@@ -19,9 +19,11 @@ MEASURES = {  # name: (title, whether higher is better)
     "later_cd": ("Chamfer distance of the frames that no fit has seen [1e-4, unit cube]", False),
     "psnr": ("PSNR on held-out views [dB]", True),
     "ssim": ("SSIM on held-out views", True),
+    "flip": ("ꟻLIP on held-out views", False),
     "lpips": ("LPIPS on held-out views", False),
     "crop_psnr": ("PSNR of the crop around the body [dB]", True),
     "crop_ssim": ("SSIM of the crop around the body", True),
+    "crop_flip": ("ꟻLIP of the crop around the body", False),
     "crop_lpips": ("LPIPS of the crop around the body", False),
 }
 FLOOR, PAPER = "resampling floor", "paper: "

@@ -10,6 +10,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from neuido.models.inference.pipeline import carry_points, render_motion
 from neuido.models.inference.prepared_scene import PreparedScene
+from neuido.models.scoring.flip import flip
 from neuido.models.scoring.lpips import LPIPS, Absent
 from neuido.models.scoring.metrics import chamfer_distance, resampling_floor
 from neuido.models.video.flow import body_window
@@ -60,7 +61,7 @@ def score_motion(prepared: PreparedScene, motion: ParticleState, floor: Tensor |
 
 @torch.no_grad()
 def score_images(prepared: PreparedScene, motion: ParticleState, views: Sequence[int], lpips: LPIPS | Absent) -> list[dict[str, Any]]:
-    """Return PSNR [dB], SSIM, LPIPS and the IoU of the silhouettes for each view and each frame after the first.
+    """Return PSNR [dB], SSIM, ꟻLIP, LPIPS and the IoU of the silhouettes for each view and each frame after the first.
 
     Image metrics are computed on the full frame and, with the prefix `crop_`, on a crop around the body. Metrics that cannot be computed
     are left out.
@@ -96,6 +97,7 @@ def _image_rows(images: Tensor, recorded: Tensor, lpips: LPIPS | Absent) -> list
         with torch.backends.cudnn.flags(enabled=torch.backends.cudnn.enabled, allow_tf32=False):  # TF32 would lose the variances
             ssim = [structural_similarity_index_measure(x, y, data_range=1.0, reduction="none") for x, y in zip(a.split(16), b.split(16))]
         columns["ssim"] = torch.cat([part.reshape(-1) for part in ssim])
+    columns["flip"] = torch.cat([flip(x, y) for x, y in zip(a.split(16), b.split(16))])
     if isinstance(lpips, LPIPS) and min(a.shape[-2:]) >= 32:
         columns["lpips"] = torch.cat([lpips(x, y) for x, y in zip(a.split(8), b.split(8))])
     return [dict(zip(columns, row)) for row in torch.stack(list(columns.values()), 1).tolist()]

@@ -20,7 +20,7 @@ from neuido.models.scoring.lpips import LPIPS, Absent, open_lpips
 from neuido.models.stages.training import SteadyModule
 from neuido.types import ParticleState
 
-SCORES = ("cd", "floor", "rmse", "psnr", "ssim", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_lpips")
+SCORES = ("cd", "floor", "rmse", "psnr", "ssim", "flip", "lpips", "iou", "crop_psnr", "crop_ssim", "crop_flip", "crop_lpips")
 STILL_IMAGE, STILL_MASK = 1e-6, 1e-5
 """Floors of the mean squared change from the first frame; it vanishes for a body at rest."""
 
