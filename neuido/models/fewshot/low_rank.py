@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, read_tensors, write_tensors
+from neuido.models.fewshot.posterior_start import most_probable, possible_latents
 from neuido.models.inference.law_file import FORMAT as LAW_FORMAT
 from neuido.models.inference.law_file import save_law
 from neuido.models.inference.pipeline import infer_latent
@@ -37,9 +38,11 @@ class LowRankAdaptation(Method):
 
     Args:
         operator: File of the operator, or `pretrained`; its weights stay frozen.
-        start: Initial z: `encoder` (its zero-shot estimate), `mean` (of the latents of Stage I), the name of a family (the mean of its
+        start: Initial z: `encoder` (its zero-shot estimate), `posterior` (of `start_draws` latents that this estimate leaves possible,
+            the one whose images are nearest: `posterior_start`), `mean` (of the latents of Stage I), the name of a family (the mean of its
             latents, e.g. `elastic`) or of a single latent, or a law file of `neuido predict`.
-        init_from: File of the encoder, or `pretrained`; only read for `start: encoder`.
+        init_from: File of the encoder, or `pretrained`; only read for `start: encoder` and `posterior`.
+        start_draws: Number of latents that `start: posterior` simulates.
         rank: LoRA rank r (paper: 16); 0: no adapter, only z is refined.
         alpha: LoRA alpha (paper: 16); the low-rank update is scaled by alpha / r.
         lr: Learning rate of the adapter.
@@ -47,7 +50,8 @@ class LowRankAdaptation(Method):
         prior_weight: Weight of the squared distance of z from its initial value, mean over the components of z.
         plausibility_weight: Weight of the penalty on elastic laws that a rollout would not survive (`law_properties.implausibility`);
             paper: 0.
-        seed: Seed of the random factor of LoRA. The other factor is zero, so the fit starts at the unchanged law.
+        seed: Seed of the random factor of LoRA, and of the draws of `start: posterior`. The other factor is zero, so the fit starts at the
+            unchanged law.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class LowRankAdaptation(Method):
         operator: str = "pretrained",
         start: str = "encoder",
         init_from: str = "pretrained",
+        start_draws: int = 64,
         rank: int = 16,
         alpha: float = 16.0,
         lr: float = 3e-3,
@@ -68,13 +73,14 @@ class LowRankAdaptation(Method):
                             "latent_lr": latent_lr}.items():  # fmt: skip
             if not value >= 0:
                 raise UserError(f"model.method.{name} = {value}: it must not be negative")
-        if not alpha > 0:
-            raise UserError(f"model.method.alpha = {alpha}: it must be positive")
+        for name, value in {"alpha": alpha, "start_draws": start_draws}.items():
+            if not value > 0:
+                raise UserError(f"model.method.{name} = {value}: it must be positive")
         self.start, self.rank, self.alpha, self.lr, self.latent_lr, self.seed = start, rank, alpha, lr, latent_lr, seed
-        self.prior_weight, self.plausibility_weight = prior_weight, plausibility_weight
+        self.prior_weight, self.plausibility_weight, self.start_draws = prior_weight, plausibility_weight, start_draws
         self.tuned: nn.Module = IntrinsicDynamicsOperator.load(operator).eval().requires_grad_(False)
         self.fingerprint = self.operator.fingerprint()
-        if start == "encoder":
+        if start in ("encoder", "posterior"):
             encoder = DynamicsEncoder.load(init_from).requires_grad_(False)
             encoder.check_operator(self.operator, f"model.method.init_from = {init_from}")
             object.__setattr__(self, "encoder", encoder)  # shared by all scenes, not part of a checkpoint
@@ -94,7 +100,8 @@ class LowRankAdaptation(Method):
             return latents[own].mean(0)
         if not self.start.endswith(".safetensors"):
             if self.start not in self.operator.latent_names:
-                known = ", ".join(["encoder", "mean", *sorted(set(self.operator.latent_families)), *self.operator.latent_names[:3]])
+                families = sorted(set(self.operator.latent_families))
+                known = ", ".join(["encoder", "posterior", "mean", *families, *self.operator.latent_names[:3]])
                 raise UserError(f"model.method.start = {self.start!r}: one of {known}, ..., or a law file (.safetensors)")
             return self.operator.latent(self.start)
         _, tensors, _ = read_weights(self.start, (LAW_FORMAT,), "model.method.start")
@@ -108,6 +115,8 @@ class LowRankAdaptation(Method):
         self.tuned.to(device)
         if self.encoder is not None:
             z = infer_latent(self.encoder.to(device), self.operator, scene, repeat=1).z
+            if self.start == "posterior":
+                z, _ = most_probable(scene, self.operator, possible_latents(self.operator, z, self.start_draws, self.seed))
         else:
             z = self._named_start()
         self.z = nn.Parameter(z.detach().clone().to(device))
