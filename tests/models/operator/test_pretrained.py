@@ -1,6 +1,7 @@
 """The weights that come with the package: small, loadable, near the laws they were trained on, and described by their card."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,6 +91,21 @@ def test_materials_differ(operator):
     F = deformations(1e-2)
     stiffness = {name: operator.laws(operator.latent(name))[0](F).norm().item() for name in FAMILY_OF}
     assert stiffness["jelly"] * 2 < stiffness["plasticine"] < stiffness["sand"] / 2
+
+
+@pytest.mark.parametrize("name", PRETRAINED)
+@torch.no_grad()
+def test_the_page_of_the_weights_says_which_have_the_right_sign_everywhere(name):
+    """Compressed matter resists and inverted matter is turned back, for each latent of the file; `test_bounded` has the whole grid."""
+    operator = IntrinsicDynamicsOperator.load(name)
+    size = torch.tensor([0.01, 0.1, 0.2, 0.5])[:, None]
+    squeezed, inverted = torch.diag_embed(size.expand(4, 3)), torch.diag_embed(size * torch.tensor([-1.0, 1.0, 1.0]))
+    pressure = -operator.elastic(operator.latents, squeezed.expand(len(operator.latents), 4, 3, 3)).diagonal(dim1=-2, dim2=-1).sum(-1)
+    back = operator.elastic(operator.latents, inverted.expand(len(operator.latents), 4, 3, 3))[..., 0, 0]
+    right = bool((pressure > 0).all() and (back > 0).all())
+    page = (Path(__file__).parents[3] / "docs/reference/weights.md").read_text()
+    (row,) = [line for line in page.splitlines() if line.startswith("| ") and f"`{name}`" in line]
+    assert ("right sign of the stress at every deformation" in row) == right
 
 
 def test_a_fit_starts_from_them(operator, name_of_file):

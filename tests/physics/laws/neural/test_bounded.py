@@ -37,9 +37,9 @@ def principal(tau, Q):
 
 
 def operators():
-    """The operator of the package with its latents and random ones, and operators with random weights up to ten times as large."""
-    shipped = IntrinsicDynamicsOperator.load("pretrained-bounded")
-    yield shipped, torch.cat([shipped.latents, shipped.random_latents(LATENTS - 90, torch.Generator().manual_seed(3))])
+    """`pretrained` with its latents and 1,000 random ones, and operators with random weights up to ten times as large."""
+    shipped = IntrinsicDynamicsOperator.load("pretrained")
+    yield shipped, torch.cat([shipped.latents, shipped.random_latents(LATENTS, torch.Generator().manual_seed(3))])
     z = torch.randn(LATENTS, 16, generator=torch.Generator().manual_seed(3))
     for seed, gain in ((0, 1.0), (1, 4.0), (2, 10.0)):
         torch.manual_seed(seed)
@@ -57,7 +57,7 @@ def test_every_random_law_has_the_right_signs_on_the_whole_grid():
     assert short.sum() > 100 and long.sum() > 10
     for operator, z in operators():
         with torch.no_grad():
-            tau = operator.elastic(z, F.float().expand(LATENTS, *F.shape)).double()
+            tau = operator.elastic(z, F.float().expand(len(z), *F.shape)).double()
         assert torch.isfinite(tau).all()
         t = principal(tau, Q)
         scale = t.abs().amax(-1)
@@ -113,7 +113,7 @@ def test_every_random_law_turns_inverted_matter_back():
     assert (torch.linalg.det(F) < 0).all()
     for operator, z in operators():
         with torch.no_grad():
-            t = principal(operator.elastic(z, F.float().expand(LATENTS, *F.shape)).double(), Q)
+            t = principal(operator.elastic(z, F.float().expand(len(z), *F.shape)).double(), Q)
         assert (t[..., 0] > 0).all()
         assert (t >= -1e-6 * t.amax(-1, keepdim=True)).all()
         assert (t[..., 0] >= (1 - 1e-5) * t.amax(-1)).all()
@@ -171,16 +171,19 @@ def test_features_do_not_grow_beyond_the_range_of_training():
 
 
 def plausible(seed):
-    """The jelly of the package, or a random law whose moduli are within about three of 1e5 Pa, as the simulator's steps below need it."""
-    if seed == "jelly":
-        operator = IntrinsicDynamicsOperator.load("pretrained-bounded").to(DEVICE)
-        return operator.requires_grad_(False).laws(operator.latent("jelly"))[0]
+    """The elastic law of a shipped material, or a random one whose moduli are within about three of 1e5 Pa, as the steps below need it."""
+    if isinstance(seed, tuple):
+        operator = IntrinsicDynamicsOperator.load(seed[0]).to(DEVICE)
+        return operator.requires_grad_(False).laws(operator.latent(seed[1]))[0]
     *first, W3, b3 = law(BoundedElastic, scenes=1, seed=seed, dtype=torch.float32).tensors()
     return BoundedElastic(*(t.to(DEVICE) for t in (*first, 0.3 * W3, 0.3 * b3)))
 
 
+SHIPPED = [(weights, material) for weights in ("pretrained", "pretrained-materials") for material in ("jelly", "plasticine", "sand")]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, "jelly"])
+@pytest.mark.parametrize("seed", [0, 1, *SHIPPED], ids=str)
 def test_a_body_crushed_to_a_tenth_comes_back(seed):
     body = block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (8, 8, 8))
     scene = Scene(lower=(-1.0,) * 3, upper=(2.0,) * 3, gravity=(0.0, 0.0, 0.0), cells=48, dt=1e-4, walls=None)
@@ -194,10 +197,18 @@ def test_a_body_crushed_to_a_tenth_comes_back(seed):
     assert float(torch.linalg.det(frames.F[-1]).median()) > 0.3
 
 
+GAINS = {("pretrained", "jelly"): 1.5, ("pretrained-materials", "jelly"): 2.0}
+"""Most kinetic energy after a fall at 30 m/s, relative to that before it, of laws that gain some."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "speed", "gain"), [(0, 30.0, 1.02), (1, 30.0, 1.02), ("jelly", 10.0, 1.02), ("jelly", 30.0, 1.5)])
+@pytest.mark.parametrize(
+    ("seed", "speed", "gain"),
+    [(seed, speed, GAINS.get(seed, 1.02) if speed > 10 else 1.02) for seed in (0, 1, *SHIPPED) for speed in (10.0, 30.0)],
+    ids=str,
+)
 def test_a_body_dropped_at_30_metres_a_second_bounces(seed, speed, gain):
-    """The law has no energy: jelly crushed to a millionth of its volume, far beyond training, gains 37 %; else none is gained."""
+    """The law has no energy: jelly crushed to a millionth of its volume, far beyond training, gains 37 and 85 %; else none is gained."""
     body = block((0.4, 0.2, 0.4), (0.6, 0.4, 0.6), (8, 8, 8), velocity=(0.0, -speed, 0.0))
     scene = Scene(gravity=(0.0, 0.0, 0.0), cells=16, dt=5e-5, walls=Walls("separate"))
     sim = Simulator(scene, body, device=DEVICE)
@@ -205,6 +216,6 @@ def test_a_body_dropped_at_30_metres_a_second_bounces(seed, speed, gain):
     assert torch.isfinite(frames.x).all()
     kinetic = frames.v.square().sum(-1).mean(-1)
     assert float(kinetic.max()) <= gain * float(kinetic[0])
-    assert float(frames.v[-1, :, 1].mean()) > 1.0
+    assert float(frames.v[..., 1].mean(1).max()) > 1.0
     extent = frames.x[-1].amax(0) - frames.x[-1].amin(0)
     assert float(extent.min()) > 0.1  # half of its first size
