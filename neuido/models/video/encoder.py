@@ -29,9 +29,10 @@ WEIGHTS = Path(__file__).parents[1] / "weights"
 PRETRAINED = {
     "pretrained": WEIGHTS / "stage2_bounded.safetensors",
     "pretrained-small": WEIGHTS / "stage2_small_bounded.safetensors",
-    "pretrained-objective": WEIGHTS / "stage2.safetensors",
     "pretrained-small-objective": WEIGHTS / "stage2_small.safetensors",
 }
+REMOVED = "pretrained-objective"
+"""An encoder of earlier versions; the operator of this name is still there."""
 REFERENCE_INTERVAL, REFERENCE_CELL = 5e-3, 1e-2
 """Frame interval [s] and cell size [m] at which the two conditions of the projector are zero."""
 
@@ -277,11 +278,13 @@ class DynamicsEncoder(nn.Module):
     def load(cls, path: str | os.PathLike = "pretrained") -> Self:
         """Load a file of `save`, or an encoder that ships with neuido: `pretrained`, or `pretrained-small` for few, coarse frames on a CPU.
 
-        `pretrained-objective` and `pretrained-small-objective` are their predecessors, for the operator `pretrained-objective`.
+        `pretrained-small-objective` is the predecessor of the second, for the operator `pretrained-objective`.
 
         Raises:
             UserError: The file is missing, or it is not an encoder.
         """
+        if str(path) == REMOVED and not Path(path).exists():
+            raise UserError(f"encoder: {REMOVED} no longer comes with neuido: use pretrained, with the operator pretrained")
         file = PRETRAINED.get(str(path)) or Path(path)
         config, tensors, card = read_weights(file, ENCODER_FORMATS, "encoder")
         source = config.get("source")

@@ -11,7 +11,7 @@ from neuido.errors import UserError
 from neuido.models.video.flow_vae import FlowVAE
 
 PREFIX = "cogvideox:"
-PRETRAINED = Path(__file__).parents[1] / "weights" / "stage2.safetensors"
+PRETRAINED = Path(__file__).parents[1] / "weights" / "stage2_bounded.safetensors"
 
 
 class VideoVAE(Protocol):

@@ -86,10 +86,17 @@ def test_an_encoder_of_another_operator_is_refused(encoder, operator, tmp_path):
     WarmupModule(operator, init_from=encoder)  # but a training may start from it
 
 
-@pytest.mark.parametrize("names", [("pretrained", "pretrained-small"), ("pretrained-objective", "pretrained-small-objective")])
+@pytest.mark.parametrize(
+    "names", [("pretrained", "pretrained", "pretrained-small"), ("pretrained-objective", "pretrained-small-objective")]
+)
 def test_the_encoders_that_come_with_neuido_name_their_operator(names):
-    for name in names:
+    for name in names[1:]:
         DynamicsEncoder.load(name).check_operator(Operator.load(names[0]), name)
+
+
+def test_an_encoder_that_no_longer_comes_with_neuido_is_said_to_be_gone():
+    with pytest.raises(UserError, match="pretrained-objective no longer comes with neuido: use pretrained"):
+        DynamicsEncoder.load("pretrained-objective")
 
 
 def test_a_law_without_a_scene_does_not_roll_out(operator):
