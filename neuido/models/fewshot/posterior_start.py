@@ -18,6 +18,9 @@ from neuido.models.operator.law_properties import p_wave_modulus
 TRUE_OVER_READ = (0.30, 11.5)
 """90 % interval of the true P-wave modulus over the one that `pretrained` reads (58 films of unseen shapes, research/log/video.md)."""
 
+VIEWS = 2
+"""Most training views that the images are compared on; as many as a step of a fit sees."""
+
 
 def possible_latents(operator: IntrinsicDynamicsOperator, z: Tensor, count: int, seed: int = 0) -> Tensor:
     """Draw latents (n, d), n <= count, that an estimate z (d,) leaves possible; the first one is z.
@@ -50,7 +53,7 @@ def most_probable(scene: PreparedScene, operator: IntrinsicDynamicsOperator, lat
 
     A law that cannot be simulated has an infinite error. If none can, the first latent is returned.
     """
-    views = scene.training_views
+    views = scene.training_views[:: -(-len(scene.training_views) // VIEWS)]
     recorded = scene.recorded(views)
     errors = torch.full((len(latents),), float("inf"))
     for i, z in enumerate(latents):
