@@ -60,9 +60,15 @@ def table_one(rows: list[dict[str, str]], exact: list[dict[str, str]]) -> str:
     printed = rows_of(EXPERIMENTS / "table1.paper.csv")
     names = list(dict.fromkeys(row["run"] for row in printed))
     out = [[f"paper: {name}", *by_scene(chosen(printed, name), "cd", SCENES, 4)] for name in names]
-    out.append(["the paper's settings, zero-shot", *by_scene(last(exact), "cd", SCENES, 4)])
+    out += [[title, *by_scene(own, "cd", SCENES, 4)] for title, own in by_the_paper(exact)]
     out += [[title, *by_scene(chosen(rows, run, stage), "cd", SCENES, 4)] for title, run, stage in OURS]
     return table(["method", *SCENES, "mean"], out)
+
+
+def by_the_paper(rows: list[dict[str, str]]) -> list[tuple[str, list[dict[str, str]]]]:
+    """Return title and rows of each stage of the runs with the paper's settings."""
+    stages = (("the paper's settings, zero-shot", "before"), ("the paper's settings, few-shot, 100 steps", "after"))
+    return [(title, last([row for row in rows if row["stage"] == stage])) for title, stage in stages]
 
 
 def last(rows: list[dict[str, str]]) -> list[dict[str, str]]:
@@ -73,23 +79,43 @@ def last(rows: list[dict[str, str]]) -> list[dict[str, str]]:
 
 def visual(rows: list[dict[str, str]], exact: list[dict[str, str]]) -> str:
     """Return the figures of the bar chart beside Table 1: means of PSNR and SSIM on unseen views."""
-    out = [["the paper's settings, zero-shot", by_scene(last(exact), "psnr", SCENES)[-1], ""]]
-    for title, run, stage in OURS:
-        own = chosen(rows, run, stage)
-        out.append([title, *(by_scene(own, key, SCENES)[-1] for key in ("psnr", "ssim"))])
-    return table(["method", "PSNR", "SSIM"], out)
+    all_rows = [*by_the_paper(exact), *((title, chosen(rows, run, stage)) for title, run, stage in OURS)]
+    out = [[title, *(by_scene(own, key, SCENES)[-1] for key in ("psnr", "ssim", "flip"))] for title, own in all_rows]
+    return table(["method", "PSNR", "SSIM", "ꟻLIP"], out)
 
 
-def seeds(rows: list[dict[str, str]]) -> str:
-    """Return Table 5: least, greatest, mean and variance of CD over five seeds."""
+def seeds(rows: list[dict[str, str]], run: str) -> str:
+    """Return the figures on seeds: least, greatest, mean and variance of CD, worst RMSE and PSNR, and RMSE and PSNR of NeuMA."""
     printed = {(row["run"], row["scene"]): row["cd"] for row in rows_of(EXPERIMENTS / "seeds.paper.csv")}
-    runs = ["adapt-density-150", *(f"adapt-density-150-seed{i}" for i in range(1, 5))]
     out = []
     for scene in SCENES:
-        values = [float(row["cd"]) for run in runs for row in chosen(rows, run, "after") if row["scene"] == scene]
+        own = [row for i in range(5) for row in chosen(rows, f"{run}-seed{i}" if i else run, "after") if row["scene"] == scene]
+        rival = [row for row in chosen(rows, "neuma", "after") if row["scene"] == scene]
+        cd, rmse, psnr = ([float(row[key]) for row in own] for key in ("cd", "rmse", "psnr"))
         paper = [printed.get((f"{what} of five seeds", scene), "") for what in ("least", "greatest", "mean")]
-        out.append([scene, *paper, *(f"{figure(values):.4g}" for figure in (min, max, mean, pvariance))])
-    return table(["scene", "paper: least", "greatest", "mean", "ours: least", "greatest", "mean", "variance"], out)
+        figures = [f"{figure(cd):.4g}" for figure in (min, max, mean, pvariance)] if own else [""] * 4
+        worst = [f"{1e3 * max(rmse):.3g} / {min(psnr):.1f}" if own else ""]
+        theirs = [f"{1e3 * float(row['rmse']):.3g} / {float(row['psnr']):.1f}" for row in rival]
+        out.append([scene, *paper, *figures, str(len(own)), *worst, *theirs])
+    head = ["scene", "paper: least", "greatest", "mean", "ours: least", "greatest", "mean", "variance", "seeds"]
+    return table([*head, "worst RMSE [1e-3] / PSNR", "NeuMA, 1,000 steps"], out)
+
+
+def latent_dim(rows: list[dict[str, str]]) -> str:
+    """Return the alignment by dimension of the latent: CD after Stage II, relative to that of d = 128 [%]."""
+    printed = rows_of(RESULTS / "latent_dim_printed.csv")
+    base = {row["scene"]: float(row["cd"]) for row in chosen(rows, "128", "stage2") if row.get("cd")}
+    out = []
+    for dim in ("32", "64", "256"):
+        paper = {row["scene"]: float(row["change"]) for row in chosen(printed, dim)}
+        out.append([f"paper: {dim}", *(f"{paper[scene]:+.1f} %" for scene in SCENES), f"{mean(paper.values()):+.1f} %"])
+    for dim in ("32", "64", "128", "256"):
+        own = {row["scene"]: float(row["cd"]) for row in chosen(rows, dim, "stage2") if row.get("cd")}
+        change = {scene: 100 * (own[scene] / base[scene] - 1) for scene in SCENES if scene in own and scene in base}
+        texts = [f"{change[scene]:+.1f} % ({own[scene]:.3g})" if scene in change else "" for scene in SCENES]
+        whole = f"{mean(change.values()):+.1f} % ({mean(own.values()):.3g})" if len(change) == len(SCENES) else ""
+        out.append([f"ours: {dim}", *texts, whole])
+    return table(["d", *SCENES, "mean"], out)
 
 
 def views(rows: list[dict[str, str]]) -> str:
