@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from neuido.errors import UserError
 from neuido.models.fewshot.method import Method, read_tensors, write_tensors
-from neuido.models.fewshot.posterior_start import most_probable, possible_latents
+from neuido.models.fewshot.posterior_start import explore
 from neuido.models.inference.law_file import FORMAT as LAW_FORMAT
 from neuido.models.inference.law_file import save_law
 from neuido.models.inference.pipeline import infer_latent
@@ -38,11 +38,11 @@ class LowRankAdaptation(Method):
 
     Args:
         operator: File of the operator, or `pretrained`; its weights stay frozen.
-        start: Initial z: `encoder` (its zero-shot estimate), `posterior` (of `start_draws` latents that this estimate leaves possible,
+        start: Initial z: `encoder` (its zero-shot estimate), `posterior` (of about `start_draws` laws that this estimate leaves possible,
             the one whose images are nearest: `posterior_start`), `mean` (of the latents of Stage I), the name of a family (the mean of its
             latents, e.g. `elastic`) or of a single latent, or a law file of `neuido predict`.
         init_from: File of the encoder, or `pretrained`; only read for `start: encoder` and `posterior`.
-        start_draws: Number of latents that `start: posterior` simulates.
+        start_draws: Number of laws that `start: posterior` simulates, about.
         rank: LoRA rank r (paper: 16); 0: no adapter, only z is refined.
         alpha: LoRA alpha (paper: 16); the low-rank update is scaled by alpha / r.
         lr: Learning rate of the adapter.
@@ -59,7 +59,7 @@ class LowRankAdaptation(Method):
         operator: str = "pretrained",
         start: str = "encoder",
         init_from: str = "pretrained",
-        start_draws: int = 64,
+        start_draws: int = 96,
         rank: int = 16,
         alpha: float = 16.0,
         lr: float = 3e-3,
@@ -116,7 +116,7 @@ class LowRankAdaptation(Method):
         if self.encoder is not None:
             z = infer_latent(self.encoder.to(device), self.operator, scene, repeat=1).z
             if self.start == "posterior":
-                z, _ = most_probable(scene, self.operator, possible_latents(self.operator, z, self.start_draws, self.seed))
+                z = explore(scene, self.operator, z, self.start_draws, self.seed).best
         else:
             z = self._named_start()
         self.z = nn.Parameter(z.detach().clone().to(device))

@@ -1,10 +1,12 @@
 """A fit may start from the law, among those that the encoder leaves possible, whose images are nearest."""
 
+import math
+
 import pytest
 import torch
 
 from neuido.models.fewshot.low_rank import LowRankAdaptation
-from neuido.models.fewshot.posterior_start import TRUE_OVER_READ, most_probable, pairs_of_a_family, possible_latents
+from neuido.models.fewshot.posterior_start import TRUE_OVER_READ, Draws, explore, image_error
 from neuido.models.inference.prepared_scene import prepare
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.operator.law_properties import p_wave_modulus
@@ -18,71 +20,72 @@ def operator():
 
 
 @pytest.fixture(scope="module")
-def encoder():
-    return DynamicsEncoder.load("pretrained-small").requires_grad_(False)
-
-
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory, encoder):
+def prepared(tmp_path_factory):
+    encoder = DynamicsEncoder.load("pretrained-small").requires_grad_(False)
     return prepare(tiny_scene(tmp_path_factory.mktemp("scene")), encoder)
 
 
-def test_possible_latents_lie_between_materials_of_a_family_near_the_reading(operator):
+def of_family(operator, family):
+    return operator.latents[[i for i, each in enumerate(operator.latent_families) if each == family]]
+
+
+def surplus(latents, members):
+    """By how much the way over a latent is longer than the straight one between two members, least over all pairs."""
+    a, b = members[:, None], members[None]
+    return torch.stack([((z - a).norm(dim=-1) + (z - b).norm(dim=-1) - (a - b).norm(dim=-1)).min() for z in latents])
+
+
+def test_first_draws_lie_between_materials_of_the_family_near_the_reading(operator):
     z = operator.latent("plasticine") + 0.1
-    drawn = possible_latents(operator, z, 40, seed=1)
-    assert drawn.shape == (40, 128) and torch.equal(drawn[0], z)
-    ratio = p_wave_modulus(operator, drawn[1:]) / p_wave_modulus(operator, z[None])
+    drawn = Draws(operator, z, seed=1).first("plasticine", 30)
+    assert drawn.shape == (30, 128)
+    ratio = p_wave_modulus(operator, drawn) / p_wave_modulus(operator, z[None])
     assert TRUE_OVER_READ[0] < float(ratio.min()) and float(ratio.max()) < TRUE_OVER_READ[1]
-    assert float(ratio.max() / ratio.min()) > 5  # they differ
-    pairs = pairs_of_a_family(operator.latent_families)
-    a, b = (operator.latents[i] for i in pairs.unbind(1))
-    for each in drawn[1:6]:  # on a segment the two distances add up to its length
-        surplus = (each - a).norm(dim=1) + (each - b).norm(dim=1) - (a - b).norm(dim=1)
-        assert float(surplus.min()) < 1e-3
-    assert torch.equal(drawn, possible_latents(operator, z, 40, seed=1))
-    assert not torch.equal(drawn, possible_latents(operator, z, 40, seed=2))
+    assert float(ratio.max() / ratio.min()) > 3  # they differ
+    assert float(surplus(drawn[:5], of_family(operator, "plasticine")).max()) < 1e-3
+    assert float(surplus(drawn[:5], of_family(operator, "elastic")).min()) > 0.1
+    assert torch.equal(drawn, Draws(operator, z, seed=1).first("plasticine", 30))
+    assert not torch.equal(drawn, Draws(operator, z, seed=2).first("plasticine", 30))
 
 
-def test_pairs_are_of_one_family():
-    assert pairs_of_a_family(["a", "b", "a", "b", "c"]).tolist() == [[0, 2], [1, 3]]
-    assert pairs_of_a_family(["a", "b"]).shape == (0, 2)
+def test_later_draws_lie_about_the_best(operator):
+    z = operator.latent("sand")
+    draws = Draws(operator, z, seed=0)
+    wide, narrow = (draws.about(z, "sand", 40, spread) - z for spread in (0.5, 0.1))
+    assert wide.shape == narrow.shape == (40, 128)
+    assert 2 < float(wide.norm(dim=1).mean() / narrow.norm(dim=1).mean()) < 12
+    members = of_family(operator, "sand") - z
+    toward = members / members.norm(dim=1, keepdim=True).clamp(min=1e-9)
+    for step in narrow[narrow.norm(dim=1) > 1e-6][:5]:
+        assert float((toward @ (step / step.norm())).abs().max()) == pytest.approx(1, abs=1e-4)
 
 
-def test_without_pairs_or_draws_the_estimate_stands(operator):
-    z = operator.latent("jelly")
-    assert torch.equal(possible_latents(operator, z, 1), z[None])
-    alone = IntrinsicDynamicsOperator("bounded")
-    assert torch.equal(possible_latents(alone, z, 9), z[None])
-
-
-def test_the_law_whose_images_are_nearest_is_found(prepared, operator):
-    """The scene's E is 50 kPa; soft, stiff and flowing laws are farther from its images the more they differ."""
-    elastic = [i for i, family in enumerate(operator.latent_families) if family == "elastic"]
-    moduli = p_wave_modulus(operator, operator.latents[elastic])
-    true = 5e4 * (1 - 0.25) / ((1 + 0.25) * (1 - 0.5))
-    wrong = torch.stack([operator.latents[elastic[int((moduli - f * true).abs().argmin())]] for f in (8.0, 2.5)])
-    near = operator.latents[elastic[int((moduli - true).abs().argmin())]]
-    latents = torch.cat([wrong, near[None], operator.latent("sand")[None]])
-    found, errors = most_probable(prepared, operator, latents)
-    assert torch.equal(found, near)
-    assert float(errors[0]) > float(errors[1]) > 2 * float(errors[2])
+def test_what_is_found_is_better_than_the_estimate_and_each_family_is_tried(prepared, operator):
+    """The scene's E is 50 kPa; the estimate is two and a half times as stiff."""
+    elastic = of_family(operator, "elastic")
+    z = elastic[int((p_wave_modulus(operator, elastic).log() - math.log(1.5e5)).abs().argmin())]
+    found = explore(prepared, operator, z, 24, seed=0)
+    assert set(found.families) == {"", "elastic", "plasticine", "sand"} and found.families[0] == ""
+    assert torch.equal(found.latents[0], z) and len(found.latents) == len(found.errors) == len(found.families) > 16
+    assert float(found.errors.min()) < 0.3 * float(found.errors[0])
+    assert image_error(prepared, operator, found.best) == pytest.approx(float(found.errors.min()), rel=1e-5)
+    assert 0.5 < float(p_wave_modulus(operator, found.best[None])[0]) / 6e4 < 2
 
 
 def test_a_law_that_does_not_run_is_left_out(prepared, operator):
     far = 30 * torch.randn(128, generator=torch.Generator().manual_seed(0))
     stiff = operator.latents[int(p_wave_modulus(operator, operator.latents).argmax())] + far
-    found, errors = most_probable(prepared, operator, torch.stack([stiff, operator.latent("jelly")]))
-    assert errors[0] == float("inf") and torch.isfinite(errors[1]) and torch.equal(found, operator.latent("jelly"))
-    assert torch.equal(most_probable(prepared, operator, stiff[None])[0], stiff)
+    assert image_error(prepared, operator, stiff) == math.inf
+    alone = IntrinsicDynamicsOperator.load().requires_grad_(False)
+    alone.set_latents(torch.zeros(0, 128), [], [])
+    found = explore(prepared, alone, stiff, 8)
+    assert found.errors.tolist() == [math.inf] and torch.equal(found.best, stiff)
 
 
-def test_a_fit_starts_there(prepared, encoder):
-    names = {"init_from": "pretrained-small", "rank": 0, "start_draws": 12}
+def test_a_fit_starts_there(prepared):
+    names = {"init_from": "pretrained-small", "rank": 0, "start_draws": 6}
     read, chosen = (LowRankAdaptation(start=start, **names).for_scene(prepared) for start in ("encoder", "posterior"))
     assert torch.equal(chosen.z, chosen.origin)
-    _, errors = most_probable(prepared, read.operator, torch.stack([read.z.detach(), chosen.z.detach()]))
-    assert errors[1] <= errors[0]
-    candidates = possible_latents(read.operator, read.z.detach(), 12)
-    best, errors = most_probable(prepared, read.operator, candidates)
-    torch.testing.assert_close(chosen.z.detach(), best)
-    assert len(errors) > 6 and float(errors[torch.isfinite(errors)].max()) > 1.5 * float(errors.min())
+    found = explore(prepared, read.operator, read.z.detach(), 6)
+    torch.testing.assert_close(chosen.z.detach(), found.best)
+    assert float(found.errors.min()) <= float(found.errors[0])
