@@ -59,7 +59,7 @@ class LowRankAdaptation(Method):
         operator: str = "pretrained",
         start: str = "encoder",
         init_from: str = "pretrained",
-        start_draws: int = 96,
+        start_draws: int = 160,
         rank: int = 16,
         alpha: float = 16.0,
         lr: float = 3e-3,

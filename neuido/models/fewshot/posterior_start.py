@@ -3,7 +3,7 @@
 One pass of an encoder leaves the modulus uncertain by a factor of a few, and says little of a yield stress or a friction angle. A fit from
 its estimate alone may end in a minimum nearby: a law that does not yield has no gradient towards one that does, so that a wrong law and a
 wrong filling of the body make up for each other. So laws that the estimate leaves possible are simulated, those of each family on their
-own, first at random and then about the best one, and the fit starts from the law whose images are nearest.
+own, first materials of Stage I and then laws about the best of them, and the fit starts from the law whose images are nearest.
 """
 
 from typing import NamedTuple
@@ -43,7 +43,7 @@ class Posterior(NamedTuple):
 
 
 class Draws:
-    """Draws of latents that lie between the materials of one family of Stage I.
+    """Draws of latents from the materials of one family of Stage I.
 
     Args:
         operator: The operator, with its latents.
@@ -60,12 +60,11 @@ class Draws:
         self.members = {name: members for name, members in own.items() if len(members) > 1}
 
     def first(self, family: str, count: int) -> Tensor:
-        """Draw at most `count` latents between two materials whose P-wave modulus the estimate leaves possible."""
+        """Draw at most `count` different materials whose P-wave modulus the estimate leaves possible."""
         members = self.members[family]
-        a, b = (members[torch.randint(len(members), (8 * count,), generator=self.generator)] for _ in range(2))
-        drawn = torch.lerp(a, b, torch.rand(8 * count, 1, generator=self.generator).to(a))
-        modulus = p_wave_modulus(self.operator, drawn)
-        return drawn[(modulus > self.limits[0]) & (modulus < self.limits[1])][:count]
+        modulus = p_wave_modulus(self.operator, members)
+        possible = members[(modulus > self.limits[0]) & (modulus < self.limits[1])]
+        return possible[torch.randperm(len(possible), generator=self.generator)[:count].to(possible.device)]
 
     def about(self, latent: Tensor, family: str, count: int, spread: float) -> Tensor:
         """Draw latents (count, d) on the lines from a latent to materials of its family, up to a share `spread` of the way or back."""
@@ -77,7 +76,7 @@ class Draws:
 
 @torch.no_grad()
 def explore(scene: PreparedScene, operator: IntrinsicDynamicsOperator, z: Tensor, count: int, seed: int = 0) -> Posterior:
-    """Simulate an estimate z (d,) and about `count` laws that it leaves possible: half of them at random, half about the best ones."""
+    """Simulate an estimate z (d,) and about `count` laws that it leaves possible: materials of Stage I, and laws about the best of them."""
     draws = Draws(operator, z, seed)
     found = [(z, image_error(scene, operator, z), "")]
     each = max(1, count // (2 * max(1, len(draws.members))))
