@@ -3,8 +3,9 @@
     python benchmarks/independence.py FOLDER... --out runs/independence --effects drag_linear,drag_quadratic
 
 Each folder is diagnosed as it is; with two threads; with `--minutes` 2 and 60; killed (SIGKILL) and started again; with its recordings in
-another order; in another unit (mm or kPa); and a track also with its origin 10 m away. The table in OUT/independence.md has the answer, the
-effects, and how far the figures are from those of the first way, in widths of their 90 % intervals.
+another order; in another unit (mm or kPa); and a track also with its origin 10 m away; or in those of these ways that `--ways` names, and
+on a GPU: `--ways "as it is" "on a GPU"`, which is what an experiment with bodies can be asked. The table in OUT/independence.md has the
+answer, the effects, and how far the figures and the widths of their 90 % intervals are from those of the first way, in such widths.
 """
 
 import argparse
@@ -23,6 +24,7 @@ from neuido.data.files.writing import write_text
 from neuido.data.progress import Progress
 
 WAYS = ("as it is", "two threads", "--minutes 2", "--minutes 60", "killed, started again", "another order", "mm or kPa", "10 m away")
+GPU = "on a GPU"
 LENGTHS = ("x", "y", "z")
 STRESSES = ("nominal_stress", "true_stress", "shear_stress")
 STORED = 3
@@ -63,7 +65,8 @@ def diagnosed(folder: Path, out: Path, way: str, more: list[str]) -> dict:
     """Diagnose a folder in one way and return diagnosis.json; what is done is not done again."""
     if not (out / "diagnosis.json").is_file():
         minutes = way.split()[1] if way.startswith("--minutes") else "0"
-        command = [sys.executable, "-m", "neuido", "diagnose", str(folder), "--out", str(out), "--device", "cpu", "--progress", "false"]
+        device = "cuda" if way == GPU else "cpu"
+        command = [sys.executable, "-m", "neuido", "diagnose", str(folder), "--out", str(out), "--device", device, "--progress", "false"]
         command += ["--minutes", minutes, *more]
         environment = os.environ | {"OMP_NUM_THREADS": "2" if way == "two threads" else "1"}
         if way.startswith("killed"):
@@ -93,13 +96,17 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--effects", default="", help="as of neuido diagnose; all where empty")
     parser.add_argument("--draws", default="39", help="as of neuido diagnose")
+    parser.add_argument("--ways", nargs="+", choices=(*WAYS, GPU), default=WAYS, help="the first is what the others are compared with")
     options = parser.parse_args(arguments)
     more = ["--draws", options.draws, *(["--effects", options.effects] if options.effects else [])]
-    rows = ["| folder | way | answer | effects | largest move of a figure, in widths of its interval |", "| --- | --- | --- | --- | --- |"]
-    with Progress("diagnoses", len(options.folders) * len(WAYS), unit="diagnoses") as work:
+    rows = [
+        "| folder | way | answer | effects | largest move of a figure | of a width | simulations |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    with Progress("diagnoses", len(options.folders) * len(options.ways), unit="diagnoses") as work:
         for folder in options.folders:
             first: dict = {}
-            for way in WAYS:
+            for way in options.ways:
                 work.update()
                 own = options.out / folder.name / way.replace(" ", "-").strip("-")
                 if way == "10 m away" and not (folder / "track.yaml").is_file():
@@ -107,9 +114,12 @@ def main(arguments: list[str] | None = None) -> None:
                 written = own.with_name(f"{own.name}-folder")
                 answer = diagnosed(written if written.is_dir() else rewritten(folder, written, way), own, way, more)
                 first = first or answer
-                moved = [abs(v - figures(first)[key][0]) / w for key, (v, w) in figures(answer).items() if key in figures(first) and w > 0]
+                both = [(of, figures(first)[key]) for key, of in figures(answer).items() if key in figures(first)]
+                moved = max((abs(v - before) / w for (v, _), (before, w) in both if w > 0), default=0.0)
+                wider = max((abs(w / before - 1.0) for (_, w), (_, before) in both if before > 0), default=0.0)
                 names = ", ".join(e["name"] for e in answer["effects"])
-                rows.append(f"| {folder.name} | {way} | {answer['answer']} | {names} | {max(moved, default=0.0):.1g} |")
+                count = answer["work"]["simulations"]
+                rows.append(f"| {folder.name} | {way} | {answer['answer']} | {names} | {moved:.1g} | {wider:.1g} | {count} |")
     write_text(options.out / "independence.md", "\n".join(rows) + "\n")
     print("\n".join(rows))
 

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
+from neuido.discrepancy.problems import launches
 from neuido.discrepancy.problems.candidates import body_candidates, present
 from neuido.discrepancy.problems.declared_model import CLASSICAL, classical, declared
 from neuido.discrepancy.problems.problem import Ask, Parameter, Point, Recording, Rows
-from neuido.discrepancy.problems.rollouts import BodyRollouts, Motions, substeps
+from neuido.discrepancy.problems.rollouts import BodyRollouts, Motions
 from neuido.discrepancy.problems.settings import EVERY, SETTINGS, SOLVERS
 from neuido.errors import UserError, is_out_of_memory
 from neuido.physics.effects import stress_kernels
@@ -111,22 +112,38 @@ class BodyProblem(BodyRollouts):
     def _in_one_launch(self, runs: Sequence[Run]) -> Iterator[np.ndarray]:
         """Simulate on a GPU, and yield the predictions of each run.
 
-        Recordings with the same setting share launches if their frames fall on the same substeps.
+        Recordings with the same setting share launches if their frames fall on the same substeps, and motions as `_kinds` says.
         """
         shared: dict[tuple, list[Run]] = {}
         keys, times = [], Counter()
         for run in runs:
             r, of = self.measured[run.recording], (run.setting, run.recording)
-            keys.append((run.setting, times[of], *substeps(r, r.scene.dt * EVERY[run.setting].dt)))
+            keys.append((run.setting, times[of], *launches.substeps(r, r.scene.dt * EVERY[run.setting].dt)))
             times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):
-            together = shared.pop(key, [])  # empty where an earlier run of the same launch has filled it
-            size = max((self.batch or TOGETHER) // max(len(together), 1), 1)
-            for at in range(0, max((len(one.groups) for one in together), default=0), size):
-                parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
-                self._predict([part for part in parts if part.groups])
+            for together in self._kinds(shared.pop(key, [])):  # none where an earlier run of the same launch has filled it
+                size = max((self.batch or TOGETHER) // len(together), 1)
+                for at in range(0, max(len(one.groups) for one in together), size):
+                    parts = [one._replace(groups=one.groups[at : at + size]) for one in together]
+                    self._predict([part for part in parts if part.groups])
             yield run.out
+
+    def _kinds(self, runs: Sequence[Run]) -> list[list[Run]]:
+        """Divide runs of one setting by the kernels and the inner steps of their motions; those that need too many become NaN."""
+        kinds: dict[tuple[int, int], list[Run]] = {}
+        for run in runs:
+            own: dict[tuple[int, int], list[list[int]]] = {}
+            elements = EVERY[run.setting].solver == "finite_elements"
+            for group, point in zip(run.groups, run.firsts, strict=True):
+                inner = self.inner_steps(point, run.setting) if elements else 1
+                own.setdefault((launches.stage(self._full(point)), inner), []).append(group)
+            for kind, groups in own.items():
+                kinds.setdefault(kind, []).append(run._replace(groups=groups))
+        for kind in [kind for kind in kinds if kind[1] == 0]:
+            for run in kinds.pop(kind):
+                run.out[[i for group in run.groups for i in group]] = np.nan
+        return list(kinds.values())
 
     def _groups(self, points: Sequence[Point], recording: int) -> list[list[int]]:
         """Group parameter sets with the same motion, those that differ only in `instruments` or in nuisances of other recordings."""

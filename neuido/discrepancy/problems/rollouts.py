@@ -7,7 +7,7 @@ import functools
 import gc
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,8 +17,10 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
+from neuido.discrepancy.problems import launches
 from neuido.discrepancy.problems.candidates import effects_of
 from neuido.discrepancy.problems.declared_model import laws_of
+from neuido.discrepancy.problems.launches import segment_of, substeps
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.problems.settings import AFFORDED, COARSE, CONTACT_HEIGHT, EVERY, LONGER, QUICK, SETTINGS, SOLVERS, STEADY, Setting
 from neuido.errors import UserError
@@ -30,10 +32,10 @@ from neuido.physics.runtime.events import Event
 from neuido.physics.runtime.frames import Frames
 from neuido.types import ParticleState
 
-SEGMENT = 200
-"""Number of substeps that a GPU captures as one piece, which a rollout replays. A longer piece takes longer to capture than to run."""
 KEPT = {"cpu": 24, "cuda": 96}
 """Largest number of simulators in memory. On a GPU each holds captured launches."""
+KNOWN = 10_000
+"""Largest number of stability limits in memory."""
 SIZES = (1, 4, 12, 32, 96)
 """Numbers of parameter sets per recording in a launch. Others are filled up, since each number needs own buffers and captured launches."""
 
@@ -71,6 +73,18 @@ class BodyRollouts(Problem):
 
     def margin(self, point: Point, setting: int = 0) -> float:
         """Return `Problem.margin`, the least of all recordings; of finite elements that of the inner steps they may take (`AFFORDED`)."""
+        return self._margins(tuple(sorted(point.items())), setting)
+
+    @functools.cached_property
+    def _margins(self) -> Callable[[tuple[tuple[str, float], ...], int], float]:
+        return functools.lru_cache(KNOWN)(lambda items, setting: self._margin(dict(items), setting))
+
+    def inner_steps(self, point: Point, setting: int) -> int:
+        """Return the inner steps of finite elements for a parameter set, the same in all recordings; 0 if it may not take enough."""
+        margin = self.margin(point, setting)
+        return launches.inner_steps(self._still[setting].max_inner_steps / math.exp(margin)) if margin >= 0.0 else 0
+
+    def _margin(self, point: Point, setting: int) -> float:
         recordings = range(len(self.measured))
         full = [self._full(point)] * len(recordings)
         try:
@@ -147,12 +161,14 @@ class BodyRollouts(Problem):
         lifts = np.array([self._lift(point, n, setting) for point, n in filled])
         full = [_for_lowered_body(self._full(point), lift) for (point, _), lift in zip(filled, lifts, strict=True)]
         elasticity, plasticity = self.laws(full)
-        always = () if self.device == "cpu" or len(full) == 1 else [p.name for c in self.candidates for p in c.parameters]
+        always = () if self.device == "cpu" or len(full) == 1 else launches.names(self.candidates, max(map(launches.stage, full)))
         effects = self._effects(simulator, full, [n for _, n in runs], always)
         every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt)
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment_of(steps, every)}
         elements = EVERY[setting].solver == "finite_elements"
+        if elements and len(inner := {self.inner_steps(point, setting) for points, _ in runs for point in points}) == 1 and any(inner):
+            given["inner"] = inner.pop()
         with torch.no_grad():
             if elements and len(full) == 1 and finer == 0:
                 out = _rollout_until_finite(simulator, full[0], steps, elasticity, plasticity, **given)
@@ -408,25 +424,6 @@ def _for_lowered_body(point: dict[str, float], lift: np.ndarray) -> dict[str, fl
     """Return a complete parameter set for a body that starts lower by `lift` (3,) [m]: places in space are lowered too."""
     own = {f"position_force.{a}": d for a, d in zip("xyz", lift, strict=True)}
     return {name: value - own.get(name, 0.0) for name, value in point.items()} if lift.any() else point
-
-
-def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
-    """Return the substeps between stored frames, those of the whole rollout, and whether stored frames are the recorded ones.
-
-    If not, stored frames are close to each other, to be interpolated. `dt` is the substep [s].
-    """
-    t = r.t.double().numpy()
-    every = round(r.frame_interval / dt)
-    if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
-        return every, every * (len(t) - 1), True
-    every = max(1, round(float(np.diff(t).min()) / dt / 6))
-    return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
-
-
-def segment_of(steps: int, every: int) -> int:
-    """Return the number of substeps per piece of a rollout: a divisor of `steps` and multiple of `every`, if possible <= `SEGMENT`."""
-    frames = steps // every
-    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
 
 
 def _of_particles(lifts: np.ndarray, simulator: Simulator | FiniteElements) -> Tensor:

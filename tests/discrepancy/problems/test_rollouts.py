@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.discrepancy.problems import rollouts, settings
+from neuido.discrepancy.problems import launches, rollouts, settings
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.errors import UserError
@@ -70,7 +70,7 @@ def test_fibres_and_gradients_turn_with_the_body(experiment):
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment, monkeypatch):
-    """In their order, with instruments that need no run and points that no simulation bears; one launch a setting."""
+    """In their order, with instruments that need no run and points that no simulation bears; a launch for each setting and kernels."""
     problem = body_problem(experiment, device=device)
     impossible = {"young": 1e12}
     several = [*POINTS, {**POINTS[0], "time_base:throw": 0.01}, impossible]
@@ -89,16 +89,48 @@ def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment,
         assert got.shape == (len(points), len(problem.recordings[n].y))
         np.testing.assert_allclose(got, one, atol=2e-5)
         assert [np.isnan(row).any() for row in got] == [point is impossible for point in points]
-    assert len(counts) == 3, "what is impossible is NaN where it is, and no launch is repeated without it"
+    stages = {launches.stage(point) for point in POINTS}
+    assert 1 < len(stages) < len(POINTS) and len(counts) == 2 * len(stages) + 1, "what is impossible is NaN where it is, without a repeat"
     counts.clear()
     possible = [(POINTS, n, s) for s in (0, 1) for n in (0, 1, 2)]
     list(problem._in_one_launch(problem._runs(possible)))
-    assert len(counts) == 2, "one launch a setting"
+    assert len(counts) == 2 * len(stages)
     counts.clear()
     small = body_problem(experiment, device=device, batch=3)
     list(small._in_one_launch(small._runs(possible)))
-    assert len(counts) == 6
-    assert max(counts) <= 3
+    assert len(counts) == 2 * len(POINTS) and max(counts) <= 3
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_a_launch_computes_no_more_than_its_motions_need(device, experiment, monkeypatch):
+    """A history takes three times the work of a body without one, and a viscosity many times the inner steps of finite elements."""
+    problem, elements = body_problem(experiment, device=device), settings.SOLVERS[1]
+    sizes = ({"viscosity_bulk.zeta": size} for size in np.geomspace(1.0, 1e4, 50))
+    viscous = next(point for point in sizes if problem.inner_steps(point, elements) > 4)
+    points = [
+        {},
+        {"drag_linear.k": 1.0},
+        {"young": 9e4},
+        viscous,
+        {"maxwell.ratio": 0.5, "maxwell.time": 0.01},
+        {"viscosity_bulk.zeta": 1e5},
+    ]
+    asked, rollout = [], FiniteElements.rollout
+
+    def watched(self, *args, inner, effects, **options):
+        asked.append((self.scene_count, inner, effects.viscosity_bulk is not None, effects.maxwell_ratio is not None))
+        return rollout(self, *args, inner=inner, effects=effects, **options)
+
+    monkeypatch.setattr(FiniteElements, "rollout", watched)
+    (together,) = problem._in_one_launch(problem._runs([(points, 0, elements)]))
+    assert [count for count, *_ in asked] == [2, 1, 1, 1] and [kernels for *_, kernels in asked] == [False, False, False, True]
+    inner = [n for _, n, *_ in asked]
+    assert inner[2] > 2 * max(inner[:2]) and inner[3] <= 2 * inner[0]
+    monkeypatch.setattr(FiniteElements, "rollout", rollout)
+    assert np.isnan(together[-1]).all(), "what needs more inner steps than it may take is not moved"
+    alone = [problem.predict([point], 0, elements)[0] for point in points]
+    np.testing.assert_allclose(together, alone, atol=2e-6)
+    assert all(n in launches.INNER_STEPS for n in inner)
 
 
 BESIDE = {"fibre.c": {"fibre.azimuth": 0.3, "fibre.elevation": 0.2}, "maxwell.ratio": {"maxwell.time": 0.01}}

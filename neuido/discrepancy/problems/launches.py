@@ -1,0 +1,68 @@
+"""How motions of a body are launched: their substeps, and which of them share a launch on a GPU.
+
+Those share one that need the same kernels, and the same inner steps of finite elements, because a launch computes for each of its motions
+all that one of them needs. Histories of relaxation and flow take three times the work of a body without an effect, and a viscosity takes
+ten times the inner steps.
+"""
+
+import bisect
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from neuido.data.measured.experiment import Recording as Measured
+from neuido.discrepancy.problems.problem import Candidate
+
+SEGMENT = 200
+"""Number of substeps that a GPU captures as one piece, which a rollout replays. A longer piece takes longer to capture than to run."""
+FORCES = frozenset({
+    "added_mass", "drag_linear", "drag_quadratic", "friction", "gravity", "magnus", "position_force", "restitution", "stick", "time_force",
+    "uniform_acceleration",
+})  # fmt: skip
+"""Effects that act on the grid or the nodes alone."""
+STRESSES = frozenset({
+    "fibre", "second_invariant", "stiffness_change", "stiffness_gradient", "strain_stiffening", "tension_compression", "viscosity_bulk",
+    "viscosity_shear",
+})  # fmt: skip
+"""Effects that add to the stress and have no history."""
+INNER_STEPS = sorted({factor << k for factor in (1, 3) for k in range(11)})
+"""Numbers of inner steps that finite elements take: few enough that motions of about the same need share launches and captured loops."""
+
+
+def stage(effects: Mapping[str, float]) -> int:
+    """Return the kernels that a complete parameter set needs: 0 those of the law alone, 1 forces too, 2 stresses too, 3 all."""
+    return max((_stage(name) for name, value in effects.items() if "." in name and value), default=0)
+
+
+def _stage(name: str) -> int:
+    effect = name.partition(".")[0]
+    return 1 if effect in FORCES else 2 if effect in STRESSES else 3
+
+
+def names(candidates: Sequence[Candidate], upto: int) -> list[str]:
+    """Return the parameters of all candidates whose kernels a stage has, so that one captured launch serves every set of them."""
+    return [p.name for c in candidates for p in c.parameters if _stage(p.name) <= upto]
+
+
+def inner_steps(need: float) -> int:
+    """Return the least of `INNER_STEPS` that is no less than what a motion needs."""
+    return INNER_STEPS[min(bisect.bisect_left(INNER_STEPS, need - 1e-9), len(INNER_STEPS) - 1)]
+
+
+def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
+    """Return the substeps between stored frames, those of the whole rollout, and whether stored frames are the recorded ones.
+
+    If not, stored frames are close to each other, to be interpolated. `dt` is the substep [s].
+    """
+    t = r.t.double().numpy()
+    every = round(r.frame_interval / dt)
+    if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
+        return every, every * (len(t) - 1), True
+    every = max(1, round(float(np.diff(t).min()) / dt / 6))
+    return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
+
+
+def segment_of(steps: int, every: int) -> int:
+    """Return the number of substeps per piece of a rollout: a divisor of `steps` and multiple of `every`, if possible <= `SEGMENT`."""
+    frames = steps // every
+    return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
