@@ -244,10 +244,10 @@ def contest(
 ) -> Contest:
     """Fit the candidates side by side, and stop fits that cannot catch up with the best one.
 
-    Where simulations run one by one, the leading candidates of the screening are fitted first, so that others can be given up early, and
-    candidates with many parameters come last, if at all. Where the first fits leave only noise, later candidates that are not `hopeful` get
-    no fit, and the others one each. All fits use the setting in use, which may be a quick one; those that come close are repeated under the
-    method's own setting.
+    Where simulations run one by one, the leading candidates of the screening are fitted first, so that others can be given up early.
+    Candidates with many parameters come last, if at all, where predictions are simulations. Where the first fits leave only noise, later
+    candidates that are not `hopeful` get no fit, and the others one each. All fits use the setting in use, which may be a quick one; those
+    that come close are repeated under the method's own setting.
 
     Args:
         lab: The method that predicts.
@@ -284,9 +284,11 @@ def contest(
     small = [c.key for c, *_ in starts if len(c.parameters) <= MANY]
     first = list(dict.fromkeys(small))[:LEADERS] if not before else []
     waves: list[list[Start]] = [[], [], []]
+    at_once = lab.problem.together and beyond == math.inf
+    large_too = at_once and lab.problem.settings == 1  # the slopes of many parameters are half of the work, where that is a simulation each
     for entry in starts:
         key = entry[0].key
-        waves[0 if (lab.problem.together and beyond == math.inf) or key in first else 1 if key in small else 2].append(entry)
+        waves[0 if large_too or key in first or (at_once and key in small) else 1 if key in small else 2].append(entry)
     for i, own in enumerate(waves):
         if best and own and lab.budget.skips(f"fits of {', '.join(dict.fromkeys(c.key for c, *_ in own))}", until):
             unfitted |= {c.key: NO_TIME for wave in waves[i:] for c, *_ in wave}
