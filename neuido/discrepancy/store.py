@@ -194,6 +194,9 @@ class CachedProblem(Problem):
     def quick(self, setting: int) -> int:
         return self.problem.quick(setting)
 
+    def early(self, setting: int, share: float) -> int:
+        return self.problem.early(setting, share)
+
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         return self.problem.recentred(point, setting, amounts)
 

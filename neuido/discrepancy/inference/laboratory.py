@@ -71,6 +71,12 @@ class Laboratory:
         finally:
             self.setting = before
 
+    @contextmanager
+    def early(self, share: float) -> Iterator[None]:
+        """Predict no more than this share of the time while the context is open, where that is cheaper (`Problem.early`)."""
+        with self.under(self.problem.early(self.setting, share)):
+            yield
+
     def bears(self, point: Point, setting: int) -> bool:
         """Return whether a setting is sure to run at a point: it is the suggested one, or `Problem.bears` says so."""
         return setting == self.own or self.problem.bears(point, setting)

@@ -118,7 +118,8 @@ class BodyProblem(BodyRollouts):
         keys, times = [], Counter()
         for run in runs:
             r, of = self.measured[run.recording], (run.setting, run.recording)
-            keys.append((run.setting, times[of], *launches.substeps(r, r.scene.dt * EVERY[run.setting].dt)))
+            s = EVERY[run.setting]
+            keys.append((run.setting, times[of], *launches.substeps(r, r.scene.dt * s.dt, s.share)))
             times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):

@@ -1,4 +1,4 @@
-"""How motions of a body are launched: their substeps, and which of them share a launch on a GPU.
+"""How motions of a body are launched: their substeps and frames, and which of them share a launch on a GPU.
 
 Those share one that need the same kernels, and the same inner steps of finite elements, because a launch computes for each of its motions
 all that one of them needs. Histories of relaxation and flow take three times the work of a body without an effect, and a viscosity takes
@@ -9,9 +9,12 @@ import bisect
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.problems.problem import Candidate
+from neuido.types import ParticleState
 
 SEGMENT = 200
 """Number of substeps that a GPU captures as one piece, which a rollout replays. A longer piece takes longer to capture than to run."""
@@ -49,20 +52,43 @@ def inner_steps(need: float) -> int:
     return INNER_STEPS[min(bisect.bisect_left(INNER_STEPS, need - 1e-9), len(INNER_STEPS) - 1)]
 
 
-def substeps(r: Measured, dt: float) -> tuple[int, int, bool]:
-    """Return the substeps between stored frames, those of the whole rollout, and whether stored frames are the recorded ones.
+def frames_until(r: Measured, share: float) -> int:
+    """Return the number of frames of a recording up to a share of the time from its first to its last motion, at least two."""
+    t = r.t.double().numpy()
+    return len(t) if share == 1.0 else max(int(np.sum(t <= t[1] + share * (t[-1] - t[1]) + 1e-9 * t[-1])), 2)
 
-    If not, stored frames are close to each other, to be interpolated. `dt` is the substep [s].
+
+def substeps(r: Measured, dt: float, share: float = 1.0) -> tuple[int, int, bool]:
+    """Return the substeps between stored frames, those of the rollout, and whether stored frames are the recorded ones.
+
+    If not, stored frames are close to each other, to be interpolated. `dt` is the substep [s]; a rollout may end after a share of the time.
     """
     t = r.t.double().numpy()
+    count = frames_until(r, share)
     every = round(r.frame_interval / dt)
     if every >= 1 and np.allclose(t, np.arange(len(t)) * every * dt, rtol=0.0, atol=1e-3 * r.frame_interval):
-        return every, every * (len(t) - 1), True
+        return every, every * (count - 1), True
     every = max(1, round(float(np.diff(t).min()) / dt / 6))
-    return every, every * int(np.ceil(t[-1] / (every * dt) + 1e-9)), False
+    return every, every * int(np.ceil(t[count - 1] / (every * dt) + 1e-9)), False
 
 
 def segment_of(steps: int, every: int) -> int:
     """Return the number of substeps per piece of a rollout: a divisor of `steps` and multiple of `every`, if possible <= `SEGMENT`."""
     frames = steps // every
     return every * max(n for n in range(1, frames + 1) if frames % n == 0 and (n == 1 or n * every <= SEGMENT))
+
+
+def standing_still(frames: ParticleState, count: int) -> ParticleState:
+    """Return frames (K, ...) with the last one repeated until there are `count`."""
+    return ParticleState(*(torch.cat([t, t[-1:].expand(count - len(t), *t.shape[1:])]) if len(t) < count else t for t in frames))
+
+
+def at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
+    """Interpolate frames (K, S, P, ...) that are `step` [s] apart to the times t [s]: x by cubic Hermite polynomials, others linearly."""
+    x, v, C, F = frames
+    k = (t / step).floor().long().clamp(max=len(x) - 2)
+    u = (t / step - k)[:, None, None, None]
+    x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
+    place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
+    w = u[..., None]
+    return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])

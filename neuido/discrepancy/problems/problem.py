@@ -229,6 +229,13 @@ class Problem:
         """Return a cheaper setting with about the same motion for the early search, or the setting itself if there is none."""
         return setting
 
+    def early(self, setting: int, share: float) -> int:
+        """Return a setting that predicts as this one does for this share of the time, without what follows if that is cheaper.
+
+        The data that follow have finite predictions without a meaning.
+        """
+        return setting
+
     def recentred(self, point: Point, setting: int, amounts: Sequence[float]) -> Point:
         """Return a parameter set in which a parameter of the problem takes over differences between settings, where one can.
 

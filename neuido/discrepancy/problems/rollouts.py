@@ -17,10 +17,10 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
-from neuido.discrepancy.problems import launches
+from neuido.discrepancy.problems import launches, settings
 from neuido.discrepancy.problems.candidates import effects_of
 from neuido.discrepancy.problems.declared_model import laws_of
-from neuido.discrepancy.problems.launches import segment_of, substeps
+from neuido.discrepancy.problems.launches import at_times, frames_until, segment_of, standing_still, substeps
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.problems.settings import AFFORDED, COARSE, CONTACT_HEIGHT, EVERY, LONGER, QUICK, SETTINGS, SOLVERS, STEADY, Setting
 from neuido.errors import UserError
@@ -69,11 +69,11 @@ class BodyRollouts(Problem):
     def effort(self, recording: int, setting: int = 0) -> float:
         """Return the cost of a prediction in particle-substeps; the inner steps of finite elements are not counted."""
         r = self.measured[recording]
-        return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt)[1])
+        return float(len(r.body.x) * substeps(r, r.scene.dt * EVERY[setting].dt, EVERY[setting].share)[1])
 
     def margin(self, point: Point, setting: int = 0) -> float:
         """Return `Problem.margin`, the least of all recordings; of finite elements that of the inner steps they may take (`AFFORDED`)."""
-        return self._margins(tuple(sorted(point.items())), setting)
+        return self._margins(tuple(sorted(point.items())), settings.whole(setting))
 
     @functools.cached_property
     def _margins(self) -> Callable[[tuple[tuple[str, float], ...], int], float]:
@@ -82,7 +82,7 @@ class BodyRollouts(Problem):
     def inner_steps(self, point: Point, setting: int) -> int:
         """Return the inner steps of finite elements for a parameter set, the same in all recordings; 0 if it may not take enough."""
         margin = self.margin(point, setting)
-        return launches.inner_steps(self._still[setting].max_inner_steps / math.exp(margin)) if margin >= 0.0 else 0
+        return launches.inner_steps(self._still[settings.whole(setting)].max_inner_steps / math.exp(margin)) if margin >= 0.0 else 0
 
     def _margin(self, point: Point, setting: int) -> float:
         recordings = range(len(self.measured))
@@ -163,7 +163,8 @@ class BodyRollouts(Problem):
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else launches.names(self.candidates, max(map(launches.stage, full)))
         effects = self._effects(simulator, full, [n for _, n in runs], always)
-        every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt)
+        share = EVERY[setting].share
+        every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt, share)
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment_of(steps, every)}
         elements = EVERY[setting].solver == "finite_elements"
@@ -183,7 +184,9 @@ class BodyRollouts(Problem):
         for (points, n), a, b in zip(runs, offsets[:-1], offsets[1:], strict=True):
             frames = ParticleState(*(t[:, a:b].unflatten(1, (size, -1))[:, : len(points)] for t in out))
             r = self.measured[n]
-            moved.append(frames if exact else _at_times(frames, every * r.scene.dt * EVERY[setting].dt, r.t.to(out.x)))
+            if not exact:
+                frames = at_times(frames, every * r.scene.dt * EVERY[setting].dt, r.t[: frames_until(r, share)].to(out.x))
+            moved.append(standing_still(frames, len(r.t)))
         if elements and (len(full) > 1 or finer > 0) and finer + 1 < len(FINER):
             self._refine(runs, moved, setting, finer + 1)
         return moved
@@ -230,7 +233,7 @@ class BodyRollouts(Problem):
         if EVERY[setting].solver == "finite_elements":
             return [i for i in able if not EVERY[i].lift]
         if EVERY[setting] in QUICK:
-            able = [0, *(i for i, s in enumerate(EVERY) if s.dt == EVERY[setting].dt and i != setting)]
+            able = [0, *(i for i, s in enumerate(settings.WHOLE) if s.dt == EVERY[setting].dt and i != setting)]
         without = (lambda s: s.cells < 1.0) if self.lifts else (lambda s: s.lift > 0.0)
         return [i for i in able if EVERY[i].solver == "material_points" and not without(EVERY[i])]
 
@@ -259,6 +262,9 @@ class BodyRollouts(Problem):
             return point
         most = min(MOST_LIFT * dx, self._room - 0.5 * GAP * dx)
         return {**point, CONTACT_HEIGHT: float(np.clip(height + moved, -MOST_LIFT * dx, most))}
+
+    def early(self, setting: int, share: float) -> int:
+        return settings.early(setting, share)
 
     def _lift(self, point: Point, recording: int, setting: int) -> np.ndarray:
         """Return the shift of the colliders of a recording along their normals [m], (3,)."""
@@ -289,6 +295,7 @@ class BodyRollouts(Problem):
 
     def simulator(self, recordings: Sequence[int], setting: int, count: int) -> Simulator | FiniteElements:
         """Return a simulator of `count` copies of the scene of each recording; its buffers are kept for later calls of this thread."""
+        setting = settings.whole(setting)
         key = (tuple(recordings), setting, count, threading.get_ident())
         with self._lock:
             found = self._simulators.pop(key, None)
@@ -429,14 +436,3 @@ def _for_lowered_body(point: dict[str, float], lift: np.ndarray) -> dict[str, fl
 def _of_particles(lifts: np.ndarray, simulator: Simulator | FiniteElements) -> Tensor:
     """Spread the lift (3,) of each scene to its particles, (P, 3)."""
     return torch.from_numpy(lifts).to(simulator.state.x)[simulator.particles.scene.long()]
-
-
-def _at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
-    """Interpolate frames (K, S, P, ...) that are `step` [s] apart to the times t [s]: x by cubic Hermite polynomials, others linearly."""
-    x, v, C, F = frames
-    k = (t / step).floor().long().clamp(max=len(x) - 2)
-    u = (t / step - k)[:, None, None, None]
-    x0, x1, v0, v1 = x[k], x[k + 1], v[k] * step, v[k + 1] * step
-    place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
-    w = u[..., None]
-    return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from neuido.discrepancy.inference import discretisation
 from neuido.discrepancy.inference.laboratory import Laboratory
@@ -60,6 +61,46 @@ def test_a_longer_step_moves_as_the_suggested_one_but_for_what_half_of_it_does(e
     here, half, long = (problem.predict([{}], 0, s)[0] for s in (0, 1, quick))
     d, q = half - here, long - here
     assert 0.0 < np.linalg.norm(q) < 1.5 * EVERY[quick].dt * np.linalg.norm(d)
+
+
+@pytest.mark.parametrize("solver", [*SOLVERS, "quick"], ids=["material points", "finite elements", "quick"])
+@pytest.mark.parametrize("regular", [True, False], ids=["frames on substeps", "between substeps"])
+def test_what_reads_the_first_part_of_a_recording_simulates_no_more(solver, regular, experiment):
+    problem = with_step(experiment, 0.5)
+    if not regular:
+        moved = tuple(replace(r, t=torch.cat([r.t[:3], r.t[3:] + 3e-4])) for r in problem.measured)
+        problem = replace(problem, measured=moved)
+    setting = problem.quick(0) if solver == "quick" else solver
+    whole = problem.predict([{}], 0, setting)[0]
+    times, efforts = problem.recordings[0].times, [problem.effort(0, setting)]
+    for share in (1.0, 0.8, 0.6, 0.4, 0.25):
+        early = problem.early(setting, share)
+        assert problem.early(setting, share - 0.01) == early or share == 1.0
+        (found,) = CachedProblem(problem, None).predict([{}], 0, early)
+        read = times <= times.min() + share * np.ptp(times)
+        np.testing.assert_array_equal(found[read], whole[read])
+        assert np.isfinite(found).all() and CachedProblem(problem, None).early(setting, share) == early
+        efforts.append(problem.effort(0, early))
+    assert efforts[0] == efforts[1] and np.all(np.diff(efforts[1:]) < 0) and efforts[-1] < 0.5 * efforts[0]
+    assert problem.margin({}, early) == problem.margin({}, setting) and "first 25% of the time" in problem.setting_name(early)
+
+
+def test_growing_fits_read_no_more_than_their_horizon(experiment, monkeypatch):
+    """They end where fits of whole motions end, for a part of the work."""
+    problem = with_step(experiment, 0.5)
+    work, ends = [], []
+    for whole in (True, False):
+        with monkeypatch.context() as patch:
+            if whole:
+                patch.setattr(BodyProblem, "early", lambda self, setting, share: setting)
+            lab = Laboratory(problem)
+            floor = lab.noise()
+            first = base_fits.first_part(lab, problem.declared, {"young": 7e4}, floor)
+            ((_, fit),) = base_fits.grown(lab, [(problem.declared, first)], floor)
+            ends.append(fit)
+            work.append(lab.memo.effort)
+    assert ends[0].point == ends[1].point and ends[0].cost == ends[1].cost and ends[1].setting == lab.own
+    assert work[1] < 0.8 * work[0]
 
 
 @pytest.mark.parametrize("why", ["margin", "run"])

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from neuido.discrepancy.inference import comparing, discretisation
 from neuido.discrepancy.inference.discretisation import ROUGH
 from neuido.discrepancy.inference.floors import Floor, Stand
 from neuido.discrepancy.inference.laboratory import Laboratory
-from neuido.discrepancy.inference.least_squares import Fit, NotFinite
+from neuido.discrepancy.inference.least_squares import Fit, NotFinite, Request
 from neuido.discrepancy.inference.search.search_state import Search
 from neuido.discrepancy.problems.problem import Parameter, Point
 
@@ -53,9 +54,16 @@ def early(lab: Laboratory, floor: Floor, share: float) -> Floor:
     return floor.early(lab.problem, lab.parts, share)
 
 
+def early_fits(lab: Laboratory, requests: Sequence[Request], floor: Floor, share: float) -> list[Fit]:
+    """Run fits to the data up to a share of the fitted time, after which no motion is predicted."""
+    setting = lab.setting
+    with lab.early(share):
+        return [replace(fit, setting=setting) for fit in lab.fits(requests, early(lab, floor, share))]
+
+
 def first_part(lab: Laboratory, free: Sequence[Parameter], point: Point, floor: Floor) -> Point:
     """Return the point at which a fit of the parameters to the first horizon ends."""
-    (fit,) = lab.fits([lab.request(free, point, iterations=stepwise(lab))], early(lab, floor, HORIZONS[0]))
+    (fit,) = early_fits(lab, [lab.request(free, point, iterations=stepwise(lab))], floor, HORIZONS[0])
     return fit.point
 
 
@@ -93,7 +101,7 @@ def grown(
             break
         options = {} if share == 1.0 else {"iterations": stepwise(lab)}
         requests = [lab.request(entries[i][0], point, until=until, sizes=sizes[i] if sizes else (), **options) for i, point in live]
-        fits = lab.fits(requests, early(lab, floor, share))
+        fits = early_fits(lab, requests, floor, share)
         ranked = sorted(zip((i for i, _ in live), fits, strict=True), key=lambda entry: entry[1].cost)
         ended = [(i, fit) for i, fit in ranked[:most] if fit.cost <= reach * ranked[0][1].cost]
         live = [(i, fit.point) for i, fit in ended]

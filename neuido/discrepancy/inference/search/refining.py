@@ -103,7 +103,7 @@ def growing(
     lab = search.lab
     free = (*lab.problem.declared, *(p for t in found for p in t.candidate.parameters))
     at = at_first(search, free, contests.at_declared(lab, base.point), floor, found)
-    starts = ranked_starts(lab, at, candidates, base_fits.early(lab, floor, HORIZONS[1]), free)
+    starts = ranked_starts(lab, at, candidates, floor, free)
     # one by one, the simulations for a candidate of many parameters take five times as long as for all others together
     large = [entry for entry in starts if len(entry[0].parameters) > MANY][: 1 if lab.problem.together else 0]
     live = [entry for entry in starts if entry in large or len(entry[0].parameters) <= MANY]
@@ -125,16 +125,15 @@ def growing_pairs(search: Search, base: Point, floor: Floor) -> list[Pair]:
     lab = search.lab
     free, breadth = lab.problem.declared, PAIRS if lab.problem.together else PAIRS_ONE_BY_ONE
     small = [c for c in lab.problem.candidates if len(c.parameters) <= breadth.parameters and not c.needs]
-    wide = base_fits.early(lab, floor, HORIZONS[1])
-    firsts = ranked_starts(lab, at_first(search, free, contests.at_declared(lab, base), floor), small, wide, free)[: breadth.firsts]
+    firsts = ranked_starts(lab, at_first(search, free, contests.at_declared(lab, base), floor), small, floor, free)[: breadth.firsts]
     lab.tell(f"growing pairs beside {', '.join(c.key for c, _ in firsts)}")
     requests = [lab.request((*free, *c.parameters), point, iterations=base_fits.stepwise(lab)) for c, point in firsts]
-    fits = lab.fits(requests, base_fits.early(lab, floor, HORIZONS[0]))
+    fits = base_fits.early_fits(lab, requests, floor, HORIZONS[0])
     begun: dict[frozenset[str], tuple[tuple[Candidate, Candidate], Point]] = {}
     for (c, _), fit in zip(firsts, fits, strict=True):
         if np.isfinite(fit.cost):
             beside = [other for other in small if other.name != c.name]
-            for other, point in ranked_starts(lab, fit.point, beside, wide, (*free, *c.parameters))[: breadth.seconds]:
+            for other, point in ranked_starts(lab, fit.point, beside, floor, (*free, *c.parameters))[: breadth.seconds]:
                 begun.setdefault(frozenset((c.key, other.key)), ((c, other), point))
     live = list(begun.values())
     entries = [((*free, *c.parameters, *other.parameters), point) for (c, other), point in live]
@@ -156,8 +155,10 @@ def at_first(search: Search, free: Sequence[Parameter], point: Point, floor: Flo
 def ranked_starts(
     lab: Laboratory, at: Point, candidates: Sequence[Candidate], floor: Floor, free: Sequence[Parameter]
 ) -> list[tuple[Candidate, Point]]:
-    """Return the candidates with their best starts, those first that would improve the fit at a point most beside the free parameters."""
-    ranked, _ = directions.screen(lab, at, candidates, floor, directions.slopes(lab, free, at, lab.fitted_recordings))
+    """Return the candidates with their best starts, those first that would most improve the fit to the second horizon at a point."""
+    wide = base_fits.early(lab, floor, HORIZONS[1])
+    with lab.early(HORIZONS[1]):
+        ranked, _ = directions.screen(lab, at, candidates, wide, directions.slopes(lab, free, at, lab.fitted_recordings))
     starts: dict[str, tuple[Candidate, Point]] = {}
     for _, c, _, begin in ranked:
         starts.setdefault(c.key, (c, begin))
