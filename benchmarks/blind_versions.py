@@ -165,7 +165,7 @@ def score(options: argparse.Namespace) -> None:
 
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     work = []
-    for mark in sorted(options.out.glob("*/*/*/ended.json")):
+    for mark in sorted(options.out.glob("*/*/*/ended.json"), key=lambda mark: (mark.parents[2].name != NEW, mark)):
         version, seed, case = mark.parent.relative_to(options.out).parts
         answer = (blind.answers(mark.parent) or [FAILED])[0]
         key, ended, spent = blind.key_of(options.out / "cases" / seed / case), json.loads(mark.read_text()), answer.get("work") or {}
