@@ -9,8 +9,8 @@ import yaml
 
 from neuido.data.measured.experiment import read_experiment
 from neuido.discrepancy.problems.body import body_problem
+from neuido.discrepancy.problems.body_launches import SEGMENT, segment_of
 from neuido.discrepancy.problems.declared_model import ready
-from neuido.discrepancy.problems.launches import SEGMENT, segment_of
 from neuido.discrepancy.store import CachedProblem
 from neuido.errors import UserError
 from neuido.physics.laws.classical import FixedCorotated
@@ -117,7 +117,7 @@ def test_long_recordings_run_in_pieces(folder, monkeypatch):
         assert piece % every == 0
         assert piece == every or piece <= SEGMENT
     assert segment_of(32_000, 10) == 200
-    monkeypatch.setattr("neuido.discrepancy.problems.launches.SEGMENT", 30)
+    monkeypatch.setattr("neuido.discrepancy.problems.body_launches.SEGMENT", 30)
     problem = body_problem(read_experiment(folder))
     asked, rollout = [], Simulator.rollout
 

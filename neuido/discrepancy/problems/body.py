@@ -16,7 +16,7 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
-from neuido.discrepancy.problems import launches
+from neuido.discrepancy.problems import body_launches
 from neuido.discrepancy.problems.candidates import body_candidates, present
 from neuido.discrepancy.problems.declared_model import CLASSICAL, classical, declared
 from neuido.discrepancy.problems.problem import Ask, Parameter, Point, Recording, Rows
@@ -119,7 +119,7 @@ class BodyProblem(BodyRollouts):
         for run in runs:
             r, of = self.measured[run.recording], (run.setting, run.recording)
             s = EVERY[run.setting]
-            keys.append((run.setting, times[of], *launches.substeps(r, r.scene.dt * s.dt, s.share)))
+            keys.append((run.setting, times[of], *body_launches.substeps(r, r.scene.dt * s.dt, s.share)))
             times[of] += 1
             shared.setdefault(keys[-1], []).append(run)
         for key, run in zip(keys, runs, strict=True):
@@ -138,7 +138,7 @@ class BodyProblem(BodyRollouts):
             elements = EVERY[run.setting].solver == "finite_elements"
             for group, point in zip(run.groups, run.firsts, strict=True):
                 inner = self.inner_steps(point, run.setting) if elements else 1
-                own.setdefault((launches.stage(self._full(point)), inner), []).append(group)
+                own.setdefault((body_launches.stage(self._full(point)), inner), []).append(group)
             for kind, groups in own.items():
                 kinds.setdefault(kind, []).append(run._replace(groups=groups))
         for kind in [kind for kind in kinds if kind[1] == 0]:

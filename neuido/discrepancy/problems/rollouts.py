@@ -17,10 +17,10 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
-from neuido.discrepancy.problems import launches, settings
+from neuido.discrepancy.problems import body_launches, settings
+from neuido.discrepancy.problems.body_launches import at_times, frames_until, segment_of, standing_still, substeps
 from neuido.discrepancy.problems.candidates import effects_of
 from neuido.discrepancy.problems.declared_model import laws_of
-from neuido.discrepancy.problems.launches import at_times, frames_until, segment_of, standing_still, substeps
 from neuido.discrepancy.problems.problem import Point, Problem
 from neuido.discrepancy.problems.settings import AFFORDED, COARSE, CONTACT_HEIGHT, EVERY, LONGER, QUICK, SETTINGS, SOLVERS, STEADY, Setting
 from neuido.errors import UserError
@@ -82,7 +82,7 @@ class BodyRollouts(Problem):
     def inner_steps(self, point: Point, setting: int) -> int:
         """Return the inner steps of finite elements for a parameter set, the same in all recordings; 0 if it may not take enough."""
         margin = self.margin(point, setting)
-        return launches.inner_steps(self._still[settings.whole(setting)].max_inner_steps / math.exp(margin)) if margin >= 0.0 else 0
+        return body_launches.inner_steps(self._still[settings.whole(setting)].max_inner_steps / math.exp(margin)) if margin >= 0.0 else 0
 
     def _margin(self, point: Point, setting: int) -> float:
         recordings = range(len(self.measured))
@@ -161,7 +161,7 @@ class BodyRollouts(Problem):
         lifts = np.array([self._lift(point, n, setting) for point, n in filled])
         full = [_for_lowered_body(self._full(point), lift) for (point, _), lift in zip(filled, lifts, strict=True)]
         elasticity, plasticity = self.laws(full)
-        always = () if self.device == "cpu" or len(full) == 1 else launches.names(self.candidates, max(map(launches.stage, full)))
+        always = () if self.device == "cpu" or len(full) == 1 else body_launches.names(self.candidates, max(map(body_launches.stage, full)))
         effects = self._effects(simulator, full, [n for _, n in runs], always)
         share = EVERY[setting].share
         every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt, share)

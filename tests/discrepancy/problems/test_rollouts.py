@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neuido.discrepancy.problems import launches, rollouts, settings
+from neuido.discrepancy.problems import body_launches, rollouts, settings
 from neuido.discrepancy.problems.body import BodyProblem, body_problem
 from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.errors import UserError
@@ -89,7 +89,7 @@ def test_what_is_asked_for_at_once_is_answered_as_one_by_one(device, experiment,
         assert got.shape == (len(points), len(problem.recordings[n].y))
         np.testing.assert_allclose(got, one, atol=2e-5)
         assert [np.isnan(row).any() for row in got] == [point is impossible for point in points]
-    stages = {launches.stage(point) for point in POINTS}
+    stages = {body_launches.stage(point) for point in POINTS}
     assert 1 < len(stages) < len(POINTS) and len(counts) == 2 * len(stages) + 1, "what is impossible is NaN where it is, without a repeat"
     counts.clear()
     possible = [(POINTS, n, s) for s in (0, 1) for n in (0, 1, 2)]
@@ -130,7 +130,7 @@ def test_a_launch_computes_no_more_than_its_motions_need(device, experiment, mon
     assert np.isnan(together[-1]).all(), "what needs more inner steps than it may take is not moved"
     alone = [problem.predict([point], 0, elements)[0] for point in points]
     np.testing.assert_allclose(together, alone, atol=2e-6)
-    assert all(n in launches.INNER_STEPS for n in inner)
+    assert all(n in body_launches.INNER_STEPS for n in inner)
 
 
 BESIDE = {"fibre.c": {"fibre.azimuth": 0.3, "fibre.elevation": 0.2}, "maxwell.ratio": {"maxwell.time": 0.01}}
