@@ -12,7 +12,7 @@ import numpy as np
 from neuido.data.progress import Progress
 from neuido.errors import UserError
 from neuido.export.exchange import NEAREST_SAMPLED, PALETTE, Exchange, Part, Surface
-from neuido.physics.runtime.device import start_warp
+from neuido.export.marching_cubes import find_isosurface
 
 SMOOTHING = 0.6
 """Standard deviation of the Gaussian in spacings of the particles; of a cubic lattice it leaves a ripple of exp(-(2 pi 0.6)^2/2), 0.1 %."""
@@ -63,8 +63,7 @@ def _add_frame(out: Surface, points: np.ndarray, F: np.ndarray | None, spacing: 
     """Append the surface of a frame."""
     ratio = np.ones(len(points)) if F is None else np.linalg.det(F.astype(np.float64))
     lower, cell, density = _density(points, ratio.clip(*RATIOS), spacing)
-    vertices, faces = _marching_cubes(density, 0.5 * (cell / spacing) ** 3)
-    slopes = np.stack([_at(slope, vertices) for slope in np.gradient(density)], axis=1)
+    vertices, faces, slopes = find_isosurface(density, 0.5 * (cell / spacing) ** 3)
     normals = -slopes / np.maximum(np.linalg.norm(slopes, axis=1, keepdims=True), 1e-30)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     if float(np.einsum("ni,ni->", np.cross(b - a, c - a), normals[faces[:, 0]])) < 0:
@@ -93,28 +92,11 @@ def _density(x: np.ndarray, ratio: np.ndarray, spacing: float) -> tuple[np.ndarr
     place = (x - low) / cell
     base = np.floor(place).astype(np.int64)
     part = place - base
-    density = np.zeros(math.prod(nodes))
-    for corner in np.ndindex(2, 2, 2):
-        weight = ratio * np.prod(np.where(np.array(corner) == 1, part, 1 - part), axis=1)
-        density += np.bincount(np.ravel_multi_index((base + corner).T, nodes), weight, len(density))  # type: ignore[arg-type]
+    near = np.stack([1 - part, part])
+    first, row = np.ravel_multi_index(base.T, nodes), nodes[2]
+    places, weights = [], []
+    for i, j, k in np.ndindex(2, 2, 2):
+        places.append(first + (i * nodes[1] + j) * row + k)
+        weights.append(ratio * near[i, :, 0] * near[j, :, 1] * near[k, :, 2])
+    density = np.bincount(np.concatenate(places), np.concatenate(weights), math.prod(nodes))
     return low, cell, gaussian_filter(density.reshape(nodes).astype(np.float32), smoothing / cell, truncate=REACH, mode="constant")
-
-
-def _at(grid: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return a grid's values at places in cells (n, 3), by linear interpolation."""
-    from scipy.ndimage import map_coordinates
-
-    return map_coordinates(grid, place.T, order=1, mode="nearest")
-
-
-def _marching_cubes(density: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices in cells (V, 3) and triangles (T, 3)."""
-    import warp as wp
-    from warp.geometry import IsoSurfaceMarchingCubes
-
-    start_warp()
-    nodes = density.shape
-    grid = wp.array(np.ascontiguousarray(density), dtype=float, device="cpu")
-    upper = tuple(float(n - 1) for n in nodes)
-    vertices, corners = IsoSurfaceMarchingCubes.extract(grid, level, lower=(0.0, 0.0, 0.0), upper=upper)
-    return vertices.numpy().astype(np.float64).reshape(-1, 3), corners.numpy().reshape(-1, 3)

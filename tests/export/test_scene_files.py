@@ -6,12 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
+from scipy.spatial import KDTree
 
 import neuido
 from neuido.data import cameras
 from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
 from neuido.export.exchange import exchange_of
+from neuido.export.marching_cubes import find_isosurface
 from neuido.export.reconstruction import reconstruct_surface
 from neuido.export.runs import read_run
 from neuido.models import attach_gaussians, bind, deform, load_gaussians
@@ -341,3 +344,24 @@ def test_frames_save_themselves_in_every_format_with_their_colliders(tmp_path):
     assert neuido.export(frames, tmp_path / "b.npz", every=2).is_file()
     with np.load(tmp_path / "b.npz") as archive:
         assert archive["x"].shape[0] == 2 and archive["times"] == pytest.approx([0.0, 0.01])
+
+
+def test_the_isosurface_is_that_of_warp_on_the_whole_grid():
+    import warp as wp
+    from warp.geometry import IsoSurfaceMarchingCubes
+
+    field = np.zeros((14, 17, 12), np.float32)
+    field[2:-2, 2:-2, 2:-2] = np.random.default_rng(0).random((10, 13, 8))
+    vertices, faces, slopes = find_isosurface(field, 0.6)
+    upper = tuple(float(n - 1) for n in field.shape)
+    slow, corners = IsoSurfaceMarchingCubes.extract(wp.array(field, dtype=float, device="cpu"), 0.6, lower=(0.0, 0.0, 0.0), upper=upper)
+
+    apart, same = KDTree(slow.numpy()).query(vertices)
+    assert len(vertices) == len(slow.numpy()) == len(set(same.tolist())) and apart.max() < 1e-5
+
+    def turned(triangles):
+        return {tuple(np.roll(triangle, -triangle.argmin()).tolist()) for triangle in triangles}
+
+    assert len(faces) > 1000 and turned(same[faces]) == turned(corners.numpy().reshape(-1, 3))
+    for axis, slope in enumerate(np.gradient(field)):
+        assert slopes[:, axis] == pytest.approx(map_coordinates(slope, vertices.T, order=1), abs=1e-6)
