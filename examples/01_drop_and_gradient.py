@@ -27,7 +27,7 @@ x = frames.x.detach()
 figure, panels = plt.subplots(1, 4, figsize=(9, 2.6), sharey=True)
 for panel, k in zip(panels, (0, 5, 10, 20), strict=True):
     panel.scatter(x[k, :, 0], x[k, :, 1], s=4, c=x[0, :, 1], cmap="viridis")
-    panel.set(title=f"{5 * k} ms", aspect="equal", xlim=(0.3, 0.7), ylim=(0.0, 0.35), xlabel="x [m]")
+    panel.set(title=f"{5 * k} ms", aspect="equal", xlim=(0.3, 0.7), ylim=(0.0, 0.35), xlabel="x [m]", xticks=(0.4, 0.5, 0.6))
 panels[0].set_ylabel("height [m]")
 figure.tight_layout()
 figure.savefig("drop.png")

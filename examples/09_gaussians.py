@@ -22,7 +22,7 @@ frames = simulator.rollout(100, laws.FixedCorotated(4e4, 0.3), every=20, state=s
 rest = body.x.float()
 colours = (rest - rest.min(0).values) / (rest.max(0).values - rest.min(0).values)
 gaussians = attach_gaussians(rest, body.volume.float(), colours)
-images, alphas = render(deform(gaussians, frames.F, frames.x), cameras.orbit(2, width=96, height=96, target=(0.5, 0.15, 0.5), angle=18.0))
+images, alphas = render(deform(gaussians, frames.F, frames.x), cameras.orbit(2, width=160, height=160, target=(0.5, 0.15, 0.5), angle=18.0))
 print(images.shape, "frames, views, height, width, RGB")
 
 # %%
@@ -35,5 +35,7 @@ for view in range(2):
     for k in range(6):
         panels[view, k].imshow(seen[k, view].clamp(0, 1))
         panels[view, k].axis("off")
+for k in range(6):
+    panels[0, k].set_title(f"{1e3 * float(frames.times[k]):.0f} ms", fontsize=9)
 figure.tight_layout()
-figure.savefig("gaussians.png")
+figure.savefig("gaussians.png", dpi=120)

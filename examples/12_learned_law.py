@@ -24,5 +24,7 @@ for row, name in zip(panels, ("jelly", "plasticine"), strict=True):
         panel.scatter(x[:, 0], x[:, 1], s=3, c=body.x[:, 1], cmap="plasma")
         panel.axline((0.5, 0.2), slope=-0.5, color="0.5", linewidth=1)
         panel.set(xlim=(0.2, 0.9), ylim=(0.0, 0.65), aspect="equal", title=f"{name}, {40 * k} ms")
+figure.supxlabel("x [m]")
+figure.supylabel("height [m]")
 figure.tight_layout()
 figure.savefig("learned_law.png")

@@ -46,5 +46,7 @@ for axis, k in zip(axes.flat, (0, 2, 5, 12), strict=True):
         axis.scatter(x[:, 0], x[:, 1], s=2, color=colour)
     axis.set_title(f"{1e3 * float(frames.times[k]):.0f} ms", fontsize=9)
     axis.set_aspect("equal")
+figure.supxlabel("x [m]")
+figure.supylabel("height [m]")
 plt.tight_layout()
 plt.savefig("rubber_and_sand.png", dpi=120)

@@ -54,9 +54,9 @@ print(f"{len(body.x)} particles of {float(body.volume.sum()) * 1e6:.0f} cm^3; th
 frames.save("star.npz")
 drawing = ["render", "star.npz", "--out", "star/frame.png", "--every", "4", "--eye", "[1.2, 0.8, 1.5]", "--look_at", "[0.45, 0.32, 0.5]"]
 subprocess.run([sys.executable, "-m", "neuido", *drawing], check=True)
-figure, panels = plt.subplots(1, 4, figsize=(10, 2))
-for panel, path in zip(panels, sorted(Path("star").glob("*.png")), strict=True):
+figure, panels = plt.subplots(2, 2, figsize=(10, 7.6))
+for panel, path in zip(panels.flat, sorted(Path("star").glob("*.png")), strict=True):
     panel.imshow(plt.imread(path))
     panel.axis("off")
 figure.tight_layout(pad=0.2)
-figure.savefig("mesh_body.png", dpi=130)
+figure.savefig("mesh_body.png", dpi=100)

@@ -24,7 +24,7 @@ ANSWERS = {  # what each must print
     "06": r"the methods end \d\.\d mm apart",
     "07": r"lacks strain stiffening",
     "08": r"lacks quadratic air drag",
-    "09": r"torch\.Size\(\[6, 2, 96, 96, 3\]\)",
+    "09": r"torch\.Size\(\[6, 2, 160, 160, 3\]\)",
     "10": r"Young's modulus read from the video: \d+ kPa, Poisson's ratio 0\.\d+",
     "11": r"lacks linear air drag",
     "12": "",

@@ -89,7 +89,8 @@ def import_data(
         sheet: Of a spreadsheet the only sheet to read.
         forces: Of a full field, a table with the force at each image. On a mesh, a row a load step with the force on each part of the
             boundary (right_x, top_y), or with * one file a load step with a row a part.
-        region: Of a full field, the part to use: smallest and largest x, smallest and largest y, in the unit of the files.
+        region: Of a full field, the part to use: smallest and largest x, smallest and largest y, in the unit of the files. Of Gaussians,
+            the part that is the body: smallest and largest x, y and z.
         elements: Of a full field on the nodes of a mesh, the table of its triangles or quadrilaterals (node1, node2, node3); a hole or a
             notch is then no obstacle.
         condition: Of such a specimen, plane stress (it is thin) or strain (thick, or held between plates).
@@ -149,7 +150,7 @@ def import_data(
         _check_scene_options(given)
         from neuido.models.reconstruct.scene_import import PARTICLES, import_scene
 
-        options = {key: given[key] for key in ("opacity_threshold", "density", "young", "poisson", "scale")}
+        options = {key: given[key] for key in ("opacity_threshold", "density", "young", "poisson", "scale", "region")}
         axis = None if up == "y" else up
         lines = import_scene(files, None if dry_run else out, particles=PARTICLES if particles is None else particles, up=axis, **options)
         print("\n".join(lines))
@@ -202,7 +203,8 @@ def import_data(
 
 SCENES = (".xml", ".urdf", ".json", ".yaml", ".yml", ".usd", ".usda", ".usdc", ".usdz", ".obj", ".stl", ".ply", ".glb")
 """Endings of scenes, meshes and Gaussians."""
-FOR_SCENES = ("files", "out", "kind", "density", "young", "poisson", "scale", "up", "particles", "opacity_threshold", "dry_run")
+FOR_SCENES = ("files", "out", "kind", "density", "young", "poisson", "scale", "up", "particles", "opacity_threshold", "region",
+              "dry_run")  # fmt: skip
 """Options that a scene takes."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from neuido.data.bodies.triangle_mesh import TriangleMesh, check_triangles, clean_mesh
 from neuido.data.bodies.usd_files import read_usd_mesh
-from neuido.data.files.parsing import parser_errors
+from neuido.data.files.parsing import parser_errors, refuse_pointer
 from neuido.data.files.values import number
 from neuido.errors import UserError, suggest
 from neuido.physics.runtime.lazy import import_extra
@@ -63,6 +63,7 @@ def _read_with_trimesh(path: Path, suffix: str) -> tuple[np.ndarray, np.ndarray]
     """Return vertices (V, 3) and faces (T, 3) of all parts. No other file is opened: a stream has no folder."""
     trimesh = import_extra("trimesh", f"a mesh from {path.name}", extra="mesh")
     content = path.read_bytes()
+    refuse_pointer(path, content)
     with parser_errors(path, f"{suffix[1:].upper()} file with a mesh"):
         if suffix == ".glb":
             _check_glb(content, path)

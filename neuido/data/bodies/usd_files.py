@@ -42,7 +42,7 @@ def open_stage(path: Path) -> Any:
                 raise UserError(f"{own} is not a valid USD file")
             if own.suffix.lower() == ".usdz":  # a package holds its files itself
                 continue
-            for asset in layer.GetCompositionAssetDependencies():
+            for asset in filter(None, layer.GetCompositionAssetDependencies()):  # "" is the file itself
                 named = path_inside(own.parent, asset.split(":SDF_FORMAT_ARGS:")[0], f"{own.name}: a reference", kind="folder")
                 if not path_inside(path.parent, _relative(named, path), f"{own.name}: a reference").is_file():
                     raise UserError(f"{own.name} refers to {asset}, which is missing: flatten it (usdcat --flatten)")

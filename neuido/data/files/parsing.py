@@ -62,6 +62,16 @@ def naming(path: str | os.PathLike, what: str = "") -> Iterator[None]:
         raise UserError(f"{path} {what or 'cannot be read'}: {type(error).__name__}: {one_line(error)}") from error
 
 
+def refuse_pointer(path: str | os.PathLike, start: bytes) -> None:
+    """Refuse the small text that Git LFS leaves in the place of a file which was not downloaded.
+
+    Raises:
+        UserError: The file begins like one.
+    """
+    if start.startswith(b"version https://git-lfs"):
+        raise UserError(f"{path} is not the file itself but a pointer of Git LFS to it: run `git lfs pull` in its repository")
+
+
 def one_line(error: BaseException) -> str:
     """Return the message of an exception as one line of at most 300 characters, or its type if it has no message."""
     if isinstance(error, OSError) and error.strerror:

@@ -7,7 +7,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from neuido.data.files.parsing import parser_errors
+from neuido.data.files.parsing import parser_errors, refuse_pointer
 from neuido.errors import UserError
 from neuido.physics.runtime.limits import check_limit
 
@@ -55,6 +55,7 @@ def read_ply_header(path: Path) -> Header:
         raise UserError(f"the PLY file {path} is missing")
     with path.open("rb") as stream:
         start = stream.read(HEADER_BYTES)
+    refuse_pointer(path, start)
     if not start.startswith((b"ply\n", b"ply\r")):
         kind = "a gzip file, perhaps .spz" if start.startswith(b"\x1f\x8b") else "its first line is not `ply`; perhaps a .splat file"
         raise UserError(f"{path} is not a PLY file ({kind}): export an uncompressed .ply")

@@ -13,6 +13,7 @@ from neuido.data.bodies.scanlines import enclosed_volume
 from neuido.data.bodies.triangle_mesh import TriangleMesh, clean_mesh
 from neuido.data.files.values import path_inside
 from neuido.data.neighbours import poses, soft_shapes
+from neuido.data.neighbours.collision_meshes import collision_mesh
 from neuido.data.neighbours.neighbour_scene import NeighbourScene, Obstacle, SoftBody
 from neuido.data.neighbours.poses import Pose
 from neuido.data.neighbours.xml_elements import Element, read_xml
@@ -216,7 +217,9 @@ class _Reader:
         elif kind == "ellipsoid":
             own.kind, own.mesh, volume = "mesh", soft_shapes.ellipsoid_mesh(size[:3]), 4 / 3 * math.pi * math.prod(size[:3])
         elif kind == "mesh":
-            own.mesh = self._asset(geom)
+            own.mesh = collision_mesh(self._asset(geom), name, geom.place, self.scene)
+            if own.mesh is None:
+                return
             volume = abs(enclosed_volume(own.mesh))
         else:
             self.scene.note(geom.place, f"the geom {name} of type {kind} has no counterpart and is left out")

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from neuido.data.bodies.scanlines import enclosed_volume
 from neuido.data.bodies.triangle_mesh import TriangleMesh
 from neuido.types import Vector
 
@@ -72,6 +73,7 @@ class SoftBody:
         elasticity: As `neuido.laws.material` takes it; without `young` where the file does not say.
         plasticity: The same; None: none.
         velocity: [m/s].
+        mass: In place of the density [kg]; None: the file does not say.
     """
 
     name: str
@@ -81,6 +83,14 @@ class SoftBody:
     elasticity: dict[str, Any] = field(default_factory=dict)
     plasticity: dict[str, Any] | None = None
     velocity: Vector = (0.0, 0.0, 0.0)
+    mass: float | None = None
+
+    def volume(self) -> float:
+        """Return the volume of its shape [m^3]."""
+        if self.particles is not None:
+            return float(self.particles["volume"].sum())
+        assert self.mesh is not None
+        return abs(enclosed_volume(self.mesh))
 
 
 class Placement(NamedTuple):

@@ -8,10 +8,10 @@ import numpy as np
 import yaml
 
 from neuido.data.bodies.mesh_filling import closed_mesh
-from neuido.data.bodies.scanlines import enclosed_volume
 from neuido.data.bodies.triangle_mesh import TriangleMesh
 from neuido.data.files.writing import new_folder, write_arrays, write_text
 from neuido.data.neighbours.neighbour_scene import NeighbourScene, Obstacle, SoftBody
+from neuido.data.neighbours.overlaps import note_overlaps
 from neuido.data.neighbours.poses import to_quaternion
 from neuido.errors import UserError
 from neuido.physics.laws.classical import material
@@ -23,9 +23,11 @@ COURANT = 0.4
 ROOM = 1.5
 """Space around all bodies and colliders, in longest sides of the bodies."""
 REACH = 20.0
-"""Distance of a plane up to which the domain includes it, in longest sides of the bodies."""
-CELLS = (16, 256)
-"""Fewest and most cells along the longest side of the domain."""
+"""Distance up to which the domain includes colliders, in longest sides of the bodies."""
+NAMED = 3
+"""Colliders that a line names."""
+CELLS = (16, 1024)
+"""Fewest and most cells along the longest side of the domain; the grid follows the particles, so that a large one costs no memory."""
 DURATION = 1.0
 """Simulated time where the file states no number of steps [s]."""
 ROUNDING = 1e-12
@@ -52,6 +54,7 @@ def write_scene(scene: NeighbourScene, out: Path | None, *, particles: int) -> l
         raise UserError(f"{scene.source} has no deformable body: give one as a second file, a mesh or Gaussians (.ply)")
     files: dict[str, Any] = {}
     bodies = [_body(body, b, files, particles) for b, body in enumerate(scene.bodies)]
+    note_overlaps(scene)
     domain, cells, dt, steps = _discretisation(scene, particles)
     content: dict[str, Any] = {
         "format": "neuido-scene/1",
@@ -99,6 +102,8 @@ def complete(scene: NeighbourScene, *, density: float | None, young: float | Non
                 body.elasticity[key] = default
                 scene.note("", f"{key} of {body.name} is taken as {default:g}; --{key} says another")
         body.density = density if density is not None else body.density
+        if body.density is None and body.mass and (body.mesh is not None or body.particles is not None):
+            body.density = body.mass / body.volume()
         if body.density is None:
             body.density = DENSITY
             scene.note("", f"density of {body.name} is taken as {DENSITY:g} kg/m^3; --density says another")
@@ -175,7 +180,7 @@ def _discretisation(scene: NeighbourScene, particles: int) -> tuple[Any, int, fl
         if body.particles is not None:
             each = float(np.median(body.particles["volume"]))
         else:
-            each = abs(enclosed_volume(body.mesh)) / particles  # type: ignore[arg-type]
+            each = body.volume() / particles
         spacing = min(spacing, each ** (1 / 3))
         elastic, _ = material(body.elasticity, body.plasticity)
         speed = max(speed, math.sqrt(float(elastic.modulus().max()) / body.density) + math.hypot(*body.velocity))  # type: ignore[operator]
@@ -183,12 +188,15 @@ def _discretisation(scene: NeighbourScene, particles: int) -> tuple[Any, int, fl
     if scene.domain is not None:
         domain = scene.domain
     else:
-        boxes += [box for box in (obstacle.extent() for obstacle in scene.obstacles) if box is not None]
+        boxes += _reached(scene, boxes, REACH * longest)
         boxes += [foot for obstacle in scene.obstacles if obstacle.kind == "plane" for foot in _feet(obstacle, boxes, REACH * longest)]
         low, high = np.min([box[0] for box in boxes], axis=0), np.max([box[1] for box in boxes], axis=0)
         domain = tuple((low - ROOM * longest).tolist()), tuple((high + ROOM * longest).tolist())
     side = max(u - l for l, u in zip(*domain))
-    cells = scene.cells or min(max(math.ceil(side / (PER_CELL * spacing)), CELLS[0]), CELLS[1])
+    wanted = max(math.ceil(side / (PER_CELL * spacing)), CELLS[0])
+    cells = scene.cells or min(wanted, CELLS[1])
+    if not scene.cells and wanted > cells:
+        scene.note("", f"cells of {side / cells:.3g} m are wider than {PER_CELL:g} spacings of the particles, for the domain is large")
     stable = COURANT * side / cells / speed
     dt = min(scene.dt or stable, stable)
     if scene.dt is not None and scene.dt > stable:
@@ -197,6 +205,26 @@ def _discretisation(scene: NeighbourScene, particles: int) -> tuple[Any, int, fl
         return domain, cells, dt, math.ceil(scene.dt * scene.steps / dt - 1e-6)
     scene.note("", f"the file states no duration: {DURATION:g} s are simulated (`steps` of scene.yaml)")
     return domain, cells, dt, math.ceil(DURATION / dt)
+
+
+def _reached(scene: NeighbourScene, boxes: list[Any], reach: float) -> list[Any]:
+    """Return the boxes around colliders, cut off where they are farther than `reach` [m] from the bodies."""
+    low, high = np.min([box[0] for box in boxes], axis=0) - reach, np.max([box[1] for box in boxes], axis=0) + reach
+    out, far = [], []
+    for obstacle in scene.obstacles:
+        box = obstacle.extent()
+        if box is None:
+            continue
+        if (box[1] < low).any() or (box[0] > high).any():
+            far.append(obstacle.name)
+            continue
+        if (box[0] < low).any() or (box[1] > high).any():
+            scene.note("", f"the domain ends {reach:.3g} m from the bodies, within the collider {obstacle.name}")
+        out.append((np.maximum(box[0], low), np.minimum(box[1], high)))
+    if far:
+        names = ", ".join(far[:NAMED]) + (", ..." if len(far) > NAMED else "")
+        scene.note("", f"{len(far)} colliders ({names}) are farther than {reach:.3g} m from the bodies, and outside the domain")
+    return out
 
 
 def _feet(plane: Obstacle, boxes: list[Any], reach: float) -> list[Any]:
@@ -217,7 +245,7 @@ def _summary(scene: NeighbourScene, domain: Any, cells: int, dt: float, steps: i
         if body.particles is not None:
             size = f"{len(body.particles['x'])} particles, {float(body.particles['volume'].sum()):.4g} m^3"
         else:
-            size = f"a mesh of {abs(enclosed_volume(body.mesh)):.4g} m^3"  # type: ignore[arg-type]
+            size = f"a mesh of {body.volume():.4g} m^3"
         lines.append(f"body {body.name}: {size}, {body.density:.4g} kg/m^3, {law}{plastic}")
     kinds: dict[str, int] = {}
     for obstacle in scene.obstacles:

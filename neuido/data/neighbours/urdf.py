@@ -7,12 +7,15 @@ import numpy as np
 from neuido.data.bodies.mesh_files import read_mesh
 from neuido.data.files.values import path_inside
 from neuido.data.neighbours import poses
-from neuido.data.neighbours.neighbour_scene import NeighbourScene, Obstacle
+from neuido.data.neighbours.collision_meshes import collision_mesh
+from neuido.data.neighbours.neighbour_scene import NeighbourScene, Obstacle, SoftBody
 from neuido.data.neighbours.poses import Pose
 from neuido.data.neighbours.soft_shapes import stretched
 from neuido.data.neighbours.xml_elements import Element, read_xml
 from neuido.errors import UserError
 
+FRICTION = 1.0
+"""Coulomb's coefficient where the file states none, as Gazebo has it."""
 LEFT_OUT = ("transmission", "gazebo", "sensor", "ros2_control")
 """Elements of a robot without a counterpart."""
 
@@ -35,14 +38,59 @@ def read_urdf(path: Path) -> NeighbourScene:
     for tag in LEFT_OUT:
         if found := root.named(tag):
             scene.note(found[0].place, f"{tag} ({len(found)} elements) has no counterpart and is left out")
+    rough = _contact_friction(root)
     for name, link in links.items():
         for i, collision in enumerate(link.named("collision")):
             own = collision.get("name") or (name if i == 0 else f"{name} {i}")
-            obstacle = _obstacle(collision, placed[name], own, path.parent)
-            scene.obstacles.append(obstacle.turned(poses.upright("z")))
-    if not scene.obstacles:
+            obstacle = _obstacle(collision, placed[name], own, path.parent, scene)
+            if obstacle is not None:
+                obstacle.friction = rough.get(name, FRICTION)
+                scene.obstacles.append(obstacle.turned(poses.upright("z")))
+    if not any(link.named("collision") for link in links.values()):
         scene.note(str(path), "no link has collision geometry")
+    unstated = sum(1 for name, link in links.items() if link.named("collision") and name not in rough)
+    if unstated:
+        scene.note(str(path), f"{unstated} of the links with collision geometry state no friction, which is taken as {FRICTION:g}")
+    if any(link.first("inertial") for link in links.values()):
+        scene.note(str(path), "the masses of the links are not used: the robot stands still")
+    for deformable in root.named("deformable", "reduced_deformable"):
+        _add_deformable(deformable, scene)
     return scene
+
+
+def _contact_friction(root: Element) -> dict[str, float]:
+    """Return Coulomb's coefficient of the links that state one, as Bullet (contact/lateral_friction) or Gazebo (mu1) have it."""
+    out = {}
+    for link in root.named("link"):
+        contact = link.first("contact")
+        lateral = contact.first("lateral_friction") if contact is not None else None
+        if lateral is not None and lateral.number("value", -1.0) >= 0:
+            out[link.get("name")] = lateral.number("value", -1.0)
+    for gazebo in root.named("gazebo"):
+        sliding = gazebo.first("mu1")
+        if sliding is not None and gazebo.get("reference") and sliding.number("value", -1.0) >= 0:
+            out[gazebo.get("reference")] = sliding.number("value", -1.0)
+    return out
+
+
+def _add_deformable(element: Element, scene: NeighbourScene) -> None:
+    """Add a soft body of Bullet's extension, whose shape comes from a second file."""
+    name = element.get("name") or "deformable"
+    own, inertial = SoftBody(name, elasticity={"law": "neo_hookean"}), element.first("inertial")
+    mass = inertial.first("mass") if inertial is not None else None
+    own.mass = mass.number("value", 0.0) if mass is not None else None
+    hooke = element.first("neohookean")
+    if hooke is not None:
+        shear, first = _positive(hooke, "mu"), hooke.number("lambda", 0.0)
+        own.elasticity |= {"young": shear * (3 * first + 2 * shear) / (first + shear), "poisson": first / (2 * (first + shear))}
+        if hooke.number("damping", 0.0):
+            scene.note(hooke.place, f"the damping of {name} has no counterpart and is left out")
+    for tag in ("spring", "corotated", "repulsion_stiffness", "collision_margin", "friction"):
+        if element.first(tag) is not None:
+            scene.note(element.place, f"{tag} of the deformable {name} has no counterpart and is left out")
+    shape = next((part.get("filename") for part in element.named("sim_mesh", "visual", "collision") if part.get("filename")), "")
+    scene.note(element.place, f"the shape of the deformable {name}, {shape or 'unnamed'}, is not read: the second file is its shape")
+    scene.bodies.append(own)
 
 
 def _link_poses(root: Element, links: dict[str, Element]) -> dict[str, Pose]:
@@ -80,13 +128,13 @@ def _moved(origin: Element | None, above: Pose) -> Pose:
     return above[0] + above[1] @ np.array(at), above[1] @ poses.from_rpy(angles)
 
 
-def _obstacle(collision: Element, above: Pose, name: str, folder: Path) -> Obstacle:
+def _obstacle(collision: Element, above: Pose, name: str, folder: Path, scene: NeighbourScene) -> Obstacle | None:
     geometry = collision.first("geometry")
     shape = geometry.children[0] if geometry is not None and geometry.children else None
     if shape is None:
         raise UserError(f"{collision.place}: the collision of {name} has no geometry")
     at, rotation = _moved(collision.first("origin"), above)
-    own = Obstacle(shape.tag, name, at, rotation, friction=1.0)
+    own = Obstacle(shape.tag, name, at, rotation)
     if shape.tag == "sphere":
         own.radius = _positive(shape, "radius")
     elif shape.tag in ("cylinder", "capsule"):
@@ -107,9 +155,15 @@ def _obstacle(collision: Element, above: Pose, name: str, folder: Path) -> Obsta
         if not path.is_file():
             raise UserError(f"{shape.place}: the mesh {shape.get('filename')} is missing in {folder}")
         scale = shape.numbers("scale", 3, (1.0, 1.0, 1.0))
-        own.mesh = stretched(read_mesh(path), np.array(scale))
+        concave = collision.get("concave") in ("yes", "true", "1")
+        own.mesh = collision_mesh(stretched(read_mesh(path), np.array(scale)), name, shape.place, scene, concave=concave)
+        return None if own.mesh is None else own
+    elif shape.tag == "plane":
+        normal = shape.numbers("normal", 3, (0.0, 0.0, 1.0))
+        own.rotation = rotation @ poses.turn_between((0, 1, 0), normal or (0.0, 0.0, 1.0))
     else:
-        raise UserError(f"{shape.place}: the geometry {shape.tag} of {name} is unknown: box, cylinder, capsule, sphere or mesh")
+        scene.note(shape.place, f"the geometry {shape.tag} of {name} has no counterpart and is left out")
+        return None
     return own
 
 

@@ -53,6 +53,10 @@ class Element(NamedTuple):
         except ValueError:
             found = (float("nan"),)
         if any(value != value or abs(value) == float("inf") for value in found) or (count is not None and len(found) != count):
+            if "$(" in self.attributes[name] or "${" in self.attributes[name]:
+                raise UserError(
+                    f"{self.place}: {name} of {self.tag} is a macro, {self.attributes[name][:80]!r}: expand it with xacro first"
+                )
             many = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
             raise UserError(f"{self.place}: {name} of {self.tag} must be {many}, got {self.attributes[name][:80]!r}")
         return found
@@ -73,7 +77,7 @@ def read_xml(path: Path) -> Element:
     Raises:
         UserError: The file is missing, too large, not valid XML, declares a document type or an entity, or has too many elements.
     """
-    text = read_text(path, "is not valid XML")
+    text = read_text(path, "is not valid XML").lstrip()  # robots often have a blank line before the XML declaration
     parser = expat.ParserCreate(encoding="utf-8")
     root: list[Element] = []
     open_elements: list[Element] = []

@@ -20,6 +20,8 @@ METHODS = ("voxel", "poisson")
 REACH = 6
 """Maximum extent of a Gaussian to each side, in grid cells."""
 
+MOST_CELLS = 1 << 28
+"""Largest number of cells of a volume of opacity; each takes some ten bytes."""
 LEVEL = 0.5
 STOPPING_OPACITY = 0.2
 """Opacity that stops a ray; it is low because a shell of Gaussians is thin in places."""
@@ -95,6 +97,18 @@ def visual_hull(masks: Tensor, cameras: Cameras, lower: Vector, upper: Vector, *
     return fine
 
 
+def _cells_around(gaussians: Gaussians, spacing: float) -> tuple[Tensor, list[int]]:
+    """Return the lower corner and the cells along each axis of the lattice around Gaussians."""
+    means = gaussians.means.detach()
+    lower = means.amin(0) - (REACH + 1) * spacing
+    return lower, ((means.amax(0) - lower) / spacing + REACH + 1).ceil().long().tolist()
+
+
+def volume_cells(gaussians: Gaussians, spacing: float) -> int:
+    """Return the number of cells of `opacity_volume`."""
+    return math.prod(_cells_around(gaussians, spacing)[1])
+
+
 def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None = None) -> Volume:
     """Return the opacity of Gaussians, 1 - prod(1 - o exp(-d^2 / 2)), set to one in enclosed cells and limited by the hull.
 
@@ -105,10 +119,8 @@ def opacity_volume(gaussians: Gaussians, *, spacing: float, hull: Volume | None 
     """
     from scipy import ndimage
 
-    means = gaussians.means.detach()
-    lower = means.amin(0) - (REACH + 1) * spacing
-    shape = ((means.amax(0) - lower) / spacing + REACH + 1).ceil().int().tolist()
-    if math.prod(shape) > 2**28:
+    lower, shape = _cells_around(gaussians, spacing)
+    if math.prod(shape) > MOST_CELLS:
         raise UserError(f"a volume of {shape} cells is too large: raise its spacing, {spacing:g} m")
     clear = _transmittance(gaussians, lower, spacing, shape)
     inside = _fill_enclosed((clear < 1 - STOPPING_OPACITY).cpu().numpy())

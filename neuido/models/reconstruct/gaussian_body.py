@@ -7,10 +7,13 @@ import torch
 
 from neuido.data.neighbours.neighbour_scene import Placement
 from neuido.errors import UserError
-from neuido.models.reconstruct.filling import fill, opacity_volume
+from neuido.models.reconstruct.filling import MOST_CELLS, fill, opacity_volume, volume_cells
 from neuido.models.render.gaussians import load_gaussians
 from neuido.physics.runtime.limits import check_limit
 from neuido.types import Gaussians
+
+Box = tuple[np.ndarray, np.ndarray]
+"""Lower and upper corner."""
 
 FINE = 2.0
 """Cells of the opacity volume along the spacing of the particles; a surface is placed to about half a cell."""
@@ -24,7 +27,9 @@ CLOSE = 0.1
 """Relative difference from that number at which the filling is kept."""
 
 
-def place_gaussians(path: str | os.PathLike, placement: Placement, *, opacity: float, scale: float = 1.0) -> Gaussians:
+def place_gaussians(
+    path: str | os.PathLike, placement: Placement, *, opacity: float, scale: float = 1.0, region: Box | None = None
+) -> Gaussians:
     """Read Gaussians, leave out faint ones and those outside an area, and move the rest.
 
     Args:
@@ -32,6 +37,7 @@ def place_gaussians(path: str | os.PathLike, placement: Placement, *, opacity: f
         placement: Which are kept, and where they are put.
         opacity: Opacity at or below which a Gaussian is left out.
         scale: Metres per unit of the file, where the placement states no length.
+        region: Corners of the box that holds the body, in axes and units of the file.
 
     Raises:
         UserError: The file cannot be read, or no Gaussian is left.
@@ -40,13 +46,12 @@ def place_gaussians(path: str | os.PathLike, placement: Placement, *, opacity: f
     turn = torch.as_tensor(np.asarray(placement.rotation, np.float64))
     means = given.means @ turn.T
     kept = given.opacities > opacity
-    if placement.area is not None:
-        low, high = (torch.as_tensor(corner, dtype=torch.float64) for corner in placement.area)
-        kept = kept & ((means > low) & (means < high)).all(dim=1)
     if not bool(kept.any()):
-        where = " and lies in the area" if placement.area is not None else ""
-        raise UserError(f"{path}: none of {len(kept)} Gaussians has an opacity above {opacity:g}{where}: lower the threshold")
-    if placement.area is None and placement.length is None:
+        raise UserError(f"{path}: none of {len(kept)} Gaussians has an opacity above {opacity:g}: lower the threshold")
+    for points, box, whose in ((given.means, region, "--region"), (means, placement.area, "the area of the scene")):
+        if box is not None:
+            kept = kept & _within(points, box, kept, f"{path}: {whose}")
+    if placement.area is None and placement.length is None and region is None:
         middle, half = _bulk(means[kept])
         kept = kept & ((means - middle).abs() <= STRAY * half).all(dim=1)
     means, low, high = means[kept], means[kept].amin(0), means[kept].amax(0)
@@ -58,6 +63,21 @@ def place_gaussians(path: str | os.PathLike, placement: Placement, *, opacity: f
     target = scale * middle if placement.centre is None else torch.as_tensor(placement.centre, dtype=torch.float64)
     covariances = scale**2 * (turn @ given.covariances[kept] @ turn.T)
     return Gaussians(scale * (means - middle) + target, covariances, given.opacities[kept], given.harmonics[kept])
+
+
+def _within(points: torch.Tensor, box: Box, kept: torch.Tensor, what: str) -> torch.Tensor:
+    """Return which points (N, 3) lie in a box; at least one of those that are kept must."""
+    low, high = (torch.as_tensor(corner, dtype=torch.float64) for corner in box)
+    inside = ((points > low) & (points < high)).all(dim=1)
+    if not bool((kept & inside).any()):
+        asked, spans = (
+            " x ".join(
+                f"{x:.3g} to {y:.3g}" for x, y in zip((corner.round(decimals=9) + 0.0).tolist(), (other.round(decimals=9) + 0.0).tolist())
+            )
+            for corner, other in ((low, high), (points[kept].amin(0), points[kept].amax(0)))
+        )
+        raise UserError(f"{what}, {asked}, holds none of its Gaussians, which span {spans}")
+    return inside
 
 
 def filled_body(gaussians: Gaussians, *, particles: int) -> dict[str, np.ndarray]:
@@ -79,6 +99,9 @@ def filled_body(gaussians: Gaussians, *, particles: int) -> dict[str, np.ndarray
     half = _bulk(gaussians.means)[1]
     spacing = float(((2 * half).clamp(min=1e-3 * float(half.max())).prod() / particles) ** (1 / 3))
     for _ in range(ROUNDS):
+        if volume_cells(gaussians, spacing / FINE) > MOST_CELLS:
+            extent = " x ".join(f"{float(side):.3g}" for side in gaussians.means.amax(0) - gaussians.means.amin(0))
+            raise UserError(f"the Gaussians span {extent} m, and their bulk far less: cut the body out with --region, or lower --particles")
         volume = opacity_volume(gaussians, spacing=spacing / FINE)
         x, each = fill(volume, spacing=spacing)
         if abs(len(x) / particles - 1) < CLOSE:

@@ -37,6 +37,7 @@ def import_scene(
     poisson: float | None = None,
     scale: float | None = None,
     up: str | None = None,
+    region: Sequence[float] | None = None,
 ) -> list[str]:
     """Turn a scene of another program into a folder with `scene.yaml`, which `neuido simulate` runs.
 
@@ -51,6 +52,7 @@ def import_scene(
         poisson: Poisson's ratio, in place of that of the scene.
         scale: Metres per unit of the body's file.
         up: The axis of the body's file that points up, x, y or z.
+        region: The part of a file of Gaussians that is the body: smallest and largest x, y and z, in its units and axes.
 
     Returns:
         What was understood, and a line for each thing that has no counterpart.
@@ -79,7 +81,7 @@ def import_scene(
     if body is not None:
         if len(paths) == 2 and any(own.mesh is not None for own in scene.bodies):
             raise UserError(f"{paths[0]} has bodies of its own: leave {body} out")
-        _add_shape(scene, body, placement, particles, opacity_threshold, scale, up)
+        _add_shape(scene, body, placement, particles, opacity_threshold, scale, up, region)
     complete(scene, density=density, young=young, poisson=poisson)
     return write_scene(scene, None if out is None else Path(out).expanduser(), particles=particles)
 
@@ -111,22 +113,38 @@ def _add_shape(
     opacity: float | None,
     scale: float | None,
     up: str | None,
+    region: Sequence[float] | None,
 ) -> None:
     """Give the body of a scene its mesh, or the particles of its Gaussians."""
     own = scene.bodies[0]
     if not (path.suffix.lower() == ".ply" and _holds_gaussians(path)):
         if placement is not None:
             raise UserError(f"{path} must be the Gaussians of the scene, a 3DGS file (.ply)")
+        if region is not None:
+            raise UserError(f"--region cuts the body out of Gaussians, and {path} is a mesh")
         own.mesh = read_mesh(path, scale=scale, up=up)
         return
     placement = placement or Placement(upright(up or "y"))
     threshold = next(each for each in (opacity, placement.opacity, OPACITY) if each is not None)
-    gaussians = place_gaussians(path, placement, opacity=threshold, scale=1.0 if scale is None else scale)
+    gaussians = place_gaussians(path, placement, opacity=threshold, scale=1.0 if scale is None else scale, region=_corners(region))
     own.particles = filled_body(gaussians, particles=particles)
     own.particles["v"] = np.tile(np.array(own.velocity, float), (len(own.particles["x"]), 1))
     shown = f"{len(gaussians.means)} Gaussians above the opacity threshold"
     scene.note("", f"{path.name}: {shown}, filled with {len(own.particles['x'])} particles")
+    if scale is None and placement.length is None:
+        extent = " x ".join(f"{float(side):.3g}" for side in gaussians.means.amax(0) - gaussians.means.amin(0))
+        scene.note("", f"the units of {path.name} are taken as metres: the body is {extent} m; --scale says another")
     _keep_clamps(scene)
+
+
+def _corners(region: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the lower and the upper corner of a region that is given as smallest and largest x, y and z."""
+    if region is None:
+        return None
+    ends = np.array([number(value, "--region") for value in region])
+    if len(ends) != 6 or not (ends[::2] < ends[1::2]).all():
+        raise UserError(f"--region {list(region)} must be six numbers: smallest and largest x, y and z")
+    return ends[::2], ends[1::2]
 
 
 def _keep_clamps(scene: NeighbourScene) -> None:
@@ -140,7 +158,7 @@ def _keep_clamps(scene: NeighbourScene) -> None:
 
 
 def _holds_gaussians(path: Path) -> bool:
-    """Return whether the header of a PLY file has the columns of Gaussians."""
+    """Return whether the header of a PLY file has the columns of Gaussians, or of compressed ones."""
     with path.open("rb") as stream:
         head = stream.read(1 << 16).partition(b"end_header")[0]
-    return b" opacity" in head and b" f_dc_0" in head
+    return (b" opacity" in head and b" f_dc_0" in head) or b" packed_position" in head

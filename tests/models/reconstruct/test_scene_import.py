@@ -61,6 +61,46 @@ def test_gaussians_become_a_body(ball, tmp_path):
     assert float(body.volume.sum()) == pytest.approx(4 / 3 * np.pi * 0.112**3, rel=0.15)  # opacity one half lies 1.7 sigma outside
 
 
+def test_a_region_cuts_the_body_out_of_a_scene(ball, tmp_path):
+    lines = import_scene(ball, tmp_path / "out", particles=500, young=1e5, region=[4.9, 7, 3, 7, 3, 7])
+    body = load_scene(tmp_path / "out" / "scene.yaml").body
+    assert body.x[:, 0].min() > 4.5 and body.x[:, 0].max() > 5.8
+    assert any("taken as metres" in line and "1.1 x 2 x 2 m" in line for line in lines)
+    for region, words in (
+        ([0, 1, 0, 1, 0, 1], "holds none of its Gaussians, which span"),
+        ([1, 0, 0, 1, 0, 1], "six numbers"),
+        ([0, 1], "six numbers"),
+    ):
+        with pytest.raises(UserError, match=words):
+            import_scene(ball, None, young=1e5, region=region)
+
+
+def test_a_floor_that_reaches_far_leaves_the_body_its_cells(tmp_path):
+    floor = '<link name="base"><collision><origin xyz="0 0 -5"/><geometry><box size="300 300 10"/></geometry></collision></link>'
+    far = '<link name="far"><collision><origin xyz="900 0 0"/><geometry><sphere radius="1"/></geometry></collision></link>'
+    (tmp_path / "plane.urdf").write_text(f'<robot name="plane">{floor}{far}</robot>')
+    (tmp_path / "body.obj").write_text(TETRAHEDRON)
+    notes = "\n".join(import_scene([tmp_path / "plane.urdf", tmp_path / "body.obj"], tmp_path / "out", young=1e4, particles=400))
+    scene = load_scene(tmp_path / "out" / "scene.yaml").scene
+    spacing = (1 / 6 / 400) ** (1 / 3)
+    assert scene.upper[0] - scene.lower[0] < 50 and (scene.upper[0] - scene.lower[0]) / scene.cells < 2.1 * spacing
+    assert "within the collider base" in notes and "(far) are farther than" in notes
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "git lfs pull"),
+        (b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\nelement vertex 1\n"
+         b"property uint packed_position\nend_header\n" + bytes(8), "compressed"),
+    ],
+)  # fmt: skip
+def test_files_that_hold_no_gaussians_say_what_they_are(tmp_path, content, words):
+    (tmp_path / "splats.ply").write_bytes(content)
+    with pytest.raises(UserError, match=words):
+        import_scene(tmp_path / "splats.ply", None, young=1e5)
+
+
 def test_gaussians_are_placed_as_physgaussian_does(ball, tmp_path):
     settings = {"material": "jelly", "E": 2e4, "nu": 0.3, "density": 200, "n_grid": 32, "grid_lim": 2, "substep_dt": 1e-4, "frame_dt": 1e-2,
                 "frame_num": 2, "g": [0, 0, -9.8], "opacity_threshold": 0.02, "sim_area": [0, 10, 0, 10, 0, 10],
