@@ -14,6 +14,8 @@ NEAREST_SAMPLED = 4000
 """Particles from which the distance to the nearest neighbour is taken."""
 PALETTE = ((0.34, 0.61, 0.84), (0.90, 0.57, 0.22), (0.42, 0.66, 0.31), (0.76, 0.34, 0.43), (0.56, 0.49, 0.76), (0.46, 0.46, 0.46))
 """Colours of bodies, in turn, RGB in 0..1 (sRGB)."""
+SHARP = 0.77
+"""Cosine of the angle between two triangles, 40 degrees, beyond which their edge is drawn sharp."""
 COLLIDER_COLOUR = (0.55, 0.55, 0.55)
 SQUARE = ((0, 1, 2), (0, 2, 3))
 """Triangles of a square whose corners go anticlockwise."""
@@ -260,3 +262,21 @@ def normals_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 1.0, 0.0]).astype(np.float32)
+
+
+def with_edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a mesh with its vertices repeated along sharp edges, and their unit normals: a box is drawn with flat faces."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float64) for i in range(3))
+    flat = np.cross(b - a, c - a)
+    unit = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-30)
+    vertex, face = faces.reshape(-1), np.repeat(np.arange(len(faces)), 3)
+    many = np.bincount(vertex, minlength=len(vertices))
+    begin, each = (np.cumsum(many) - many)[vertex], many[vertex]
+    own = np.repeat(np.arange(len(vertex)), each)  # every corner with every corner at its vertex
+    other = np.argsort(vertex, kind="stable")[np.repeat(begin - np.cumsum(each) + each, each) + np.arange(len(own))]
+    smooth = np.einsum("ni,ni->n", unit[face[own]], unit[face[other]]) > SHARP
+    weights = np.where(smooth[:, None], flat[face[other]], 0.0)
+    normals = np.stack([np.bincount(own, weights[:, axis], len(vertex)) for axis in range(3)], axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    _, first, new = np.unique(np.column_stack([vertex, normals.round(4) + 0.0]), axis=0, return_index=True, return_inverse=True)
+    return vertices[vertex[first]], new.reshape(-1, 3).astype(np.int32), normals[first].astype(np.float32)

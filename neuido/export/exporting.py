@@ -27,6 +27,8 @@ FORMATS = {
 """Endings and what they stand for."""
 PARTICLES_ALONE = (".npz", ".csv")
 """Formats that hold the particles and nothing else."""
+DRAWN = (".usd", ".usdc", ".usda", ".glb", ".gltf", ".abc")
+"""Formats of programs that draw; in the others a solid keeps its vertices as they are, connected."""
 
 
 def export(
@@ -89,10 +91,19 @@ def export(
     if ending in PARTICLES_ALONE:
         return _thinned(frames, every).save(target)[0]
     made = _collected(frames, every, laws, scene, surface, surface_spacing, gaussians, cameras, progress)
+    if ending in DRAWN:
+        _sharpen(made.colliders)
     written = _write(target, ending, made, speed, progress)
     for note in made.notes:
         warnings.warn(note, PlausibilityWarning, stacklevel=2)
     return written[0]
+
+
+def _sharpen(solids: Sequence[Any]) -> None:
+    from neuido.export.exchange import with_edges
+
+    for solid in solids:
+        solid.vertices, solid.faces, solid.normals = ([part] for part in with_edges(solid.vertices[0], solid.faces[0]))
 
 
 def _check_places(ending: str, given: dict[str, bool]) -> None:

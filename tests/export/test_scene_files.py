@@ -13,7 +13,7 @@ import neuido
 from neuido.data import cameras
 from neuido.data.formats.ply import read_ply_vertices
 from neuido.errors import UserError
-from neuido.export.exchange import exchange_of
+from neuido.export.exchange import exchange_of, with_edges
 from neuido.export.marching_cubes import find_isosurface
 from neuido.export.reconstruction import reconstruct_surface
 from neuido.export.runs import read_run
@@ -365,3 +365,23 @@ def test_the_isosurface_is_that_of_warp_on_the_whole_grid():
     assert len(faces) > 1000 and turned(same[faces]) == turned(corners.numpy().reshape(-1, 3))
     for axis, slope in enumerate(np.gradient(field)):
         assert slopes[:, axis] == pytest.approx(map_coordinates(slope, vertices.T, order=1), abs=1e-6)
+
+
+def test_edges_of_a_box_stay_sharp_and_a_ball_stays_smooth():
+    corners = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([(q[0], q[i], q[i + 1]) for q in quads for i in (1, 2)], np.int32)
+    vertices, split, normals = with_edges(corners, faces)
+    assert len(vertices) == 24 and np.array_equal(vertices[split], corners[faces])
+    flat = np.cross(vertices[split[:, 1]] - vertices[split[:, 0]], vertices[split[:, 2]] - vertices[split[:, 0]])
+    assert normals[split] == pytest.approx(np.repeat(flat[:, None], 3, axis=1))
+    ball = trimesh_of_a_ball()
+    vertices, split, normals = with_edges(*ball)
+    assert len(vertices) == len(ball[0])
+    assert np.einsum("ni,ni->n", normals, vertices) == pytest.approx(np.linalg.norm(vertices, axis=1), rel=2e-3)
+
+
+def trimesh_of_a_ball():
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(3, 0.5)
+    return np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.int32)

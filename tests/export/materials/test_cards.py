@@ -4,10 +4,12 @@ import math
 from xml.etree import ElementTree
 
 import pytest
+import torch
 
 from neuido.errors import UserError
 from neuido.export.materials.cards import card_text, write_card
 from neuido.export.materials.model_constants import UNITS, constants_of
+from neuido.physics.laws.classical import material as elastic_law
 
 E, NU, RHO = 1e6, 0.45, 1100.0
 MU, K = E / (2 * (1 + NU)), E / (3 * (1 - 2 * NU))
@@ -152,3 +154,23 @@ def test_what_does_not_map_is_said(tmp_path):
 def test_incompressible_fit_has_no_bulk_term():
     assert numbers(card(RUBBER | {"incompressible": True}, "abaqus"), "*HYPERELASTIC")[1] == 0.0
     assert float(xml(card(RUBBER | {"incompressible": True}, "febio")).findtext("k")) == pytest.approx(1e3 * MU)
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "sigma"])
+def test_febio_has_these_laws_exactly(law):
+    """The Cauchy stress by the formulas of FEBio's FENeoHookean and FENaturalNeoHookean with the constants of the card."""
+    model = RUBBER | {"elasticity": {"law": law, "young": E, "poisson": 0.3}}
+    material = xml(card(model, "febio"))
+    young, poisson = float(material.findtext("E")), float(material.findtext("v"))
+    mu, lame = young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    F = torch.eye(3, dtype=torch.float64) + 0.3 * torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    J, b = torch.linalg.det(F), F @ F.mT
+    if material.get("type") == "neo-Hookean":
+        stress = (mu * (b - torch.eye(3)) + lame * J.log() * torch.eye(3)) / J
+    else:
+        values, vectors = torch.linalg.eigh(b)
+        hencky = vectors @ torch.diag(values.log() / 2) @ vectors.mT
+        volume = hencky.trace() / 3 * torch.eye(3)
+        stress = (young / (1 - 2 * poisson) * volume + 2 * mu * (hencky - volume)) / J
+    own = elastic_law(model["elasticity"], None)[0](F[None])[0] / J
+    assert J > 0.3 and torch.allclose(own, stress, rtol=1e-7, atol=1e-7 * E)  # the law has its constants in float32
