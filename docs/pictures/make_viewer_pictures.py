@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from shutil import which
 
@@ -42,7 +43,7 @@ def drop(spacing: float = 0.016, colliders: tuple = (), height: float = 0.4) -> 
 
 def moved(scene: Scene, body: Body, steps: int = 360, law: object = LAW) -> object:
     with torch.no_grad():
-        return Simulator(scene, body, device="cpu").rollout(steps, law, every=12)
+        return Simulator(scene, body, device="cpu").rollout(steps, *(law if isinstance(law, tuple) else (law,)), every=12)
 
 
 def rollout() -> Content:
@@ -123,6 +124,37 @@ def pulled(page: LivePage) -> None:
     page.show()
 
 
+def flattened() -> Content:
+    """Return a drop of plasticine, which has all quantities of a single body."""
+    scene, body = drop(0.02)
+    law = laws.Sigma(1e5, 0.3), laws.VonMises(2e3, 1e5, 0.3)
+    return content_of_frames(moved(scene, body, 288, law), title="plasticine", scene=scene, law=law[0])
+
+
+def colours(browser: object, out: Path, settle: float = 12.0) -> None:
+    """Photograph each way to colour the particles, beside one another."""
+    page = Playback(flattened(), port=8920)
+    tab = browser.new_page(viewport={"width": 700, "height": 380})
+    tab.set_default_timeout(240_000)
+    tab.goto(page.url)
+    tab.wait_for_selector("canvas")
+    pictures = []
+    for name in page.content.quantities():
+        page.colour.value = name
+        page._recolour(name)
+        page.show(24)
+        tab.wait_for_timeout(1000 * settle)
+        for cross in tab.locator(".mantine-Notification-closeButton").all():
+            cross.click()
+        pictures.append(Image.open(BytesIO(tab.screenshot())).convert("RGB"))
+    tab.close()
+    page.stop()
+    sheet = Image.new("RGB", (2 * 700, 380 * -(-len(pictures) // 2)), "white")
+    for k, picture in enumerate(pictures):
+        sheet.paste(picture, (700 * (k % 2), 380 * (k // 2)))
+    sheet.save(out, quality=80)
+
+
 def wait(done: Callable[[], bool], seconds: float = 300.0) -> None:
     end = time.monotonic() + seconds
     while not done():
@@ -139,7 +171,7 @@ def rendered(path: Path) -> None:
     )
     scene, body = drop(0.014, solids, 0.56)
     content = content_of_frames(moved(scene, body, 480), title="drop", scene=scene, law=LAW)
-    Image.fromarray(Painter(content, "strain", View(width=900, height=600)).picture(32)).save(path, quality=82)
+    Image.fromarray(Painter(content, "strain", View(width=900, height=600)).picture(26)).save(path, quality=82)
 
 
 def photograph(browser: object, url: str, path: Path, settle: float = 25.0, act: Callable[[], None] = lambda: None) -> None:
@@ -163,7 +195,7 @@ def main(names: list[str]) -> None:
     from playwright.sync_api import sync_playwright
 
     program = which("chromium") or which("chromium-browser") or which("google-chrome")
-    wanted = names or ["view", "diagnosis", "recording", "splats", "live", "notebook", "render"]
+    wanted = names or ["view", "diagnosis", "recording", "splats", "live", "notebook", "render", "colours"]
     with tempfile.TemporaryDirectory() as place, sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=program, args=FLAGS)
         folder = Path(place)
@@ -177,6 +209,8 @@ def main(names: list[str]) -> None:
             out = HERE / f"viewer-{name}.webp"
             if name == "render":
                 rendered(out)
+            elif name == "colours":
+                colours(browser, out)
             elif name == "live":
                 page = live()
                 photograph(browser, page.url, out, act=lambda page=page: pulled(page))

@@ -103,7 +103,7 @@ def player(content: Content, *, colour: str | None = None, height: int = 480) ->
     server = open_server("neuido", "localhost", FREE_PORT)
     try:
         furnish(server, content)
-        drawn = [Drawn(server, content, i) for i in range(len(content.motions))]
+        drawn = [Drawn(server, content, i, keeps=False) for i in range(len(content.motions))]
         surfaces: list[Any] = [None] * len(content.surfaces)
         times = content.times[frames]
         length = max(float(times[-1] - times[0]), 1e-9)

@@ -238,12 +238,20 @@ class Cloud:
 
 
 class Drawn:
-    """One motion of a content in the page."""
+    """One motion of a content in the page.
 
-    def __init__(self, server: Any, content: Content, index: int) -> None:
+    Args:
+        server: Server of the page.
+        content: What is shown.
+        index: Number of the motion.
+        keeps: Whether the page may keep the points of its frames. A recorded page must not: when it begins anew, what its last frame showed
+            would stay.
+    """
+
+    def __init__(self, server: Any, content: Content, index: int, *, keeps: bool = True) -> None:
         self.server, self.content, self.motion, self.index = server, content, content.motions[index], index
         spacing = self.motion.spacing * self.motion.thinning ** (1 / 3) or 0.02 * content.size
-        room = content.frames, sum(motion.x.shape[1] for motion in content.motions)
+        room = content.frames if keeps else 0, sum(motion.x.shape[1] for motion in content.motions)
         self.cloud = Cloud(server, f"motion/{index}/particles", spacing, *room)
         self.measured = Cloud(server, f"motion/{index}/measured", 0.6 * spacing)
         self.quantity = ""
