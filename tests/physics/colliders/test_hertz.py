@@ -11,6 +11,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import FixedCorotated
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Keyframes, Scene, Walls
+from tests.physics.balances import note
 from tests.physics.bodies import DEVICE
 
 RADIUS, YOUNG, POISSON = 0.2, 1e5, 0.3
@@ -59,8 +60,11 @@ def stiffness(dx: float) -> tuple[float, float]:
 
 
 @pytest.mark.slow
-def test_a_ball_pressed_by_a_mesh_sphere_approaches_hertz():
+def test_a_ball_pressed_by_a_mesh_sphere_approaches_hertz(record_property):
     coarse, fine = stiffness(0.02), stiffness(0.01)  # balls of 10 and 20 cells a radius
+    for cells, found in ((10, coarse), (20, fine)):
+        for what, value in zip(("stiffness by the slope of F^(2/3)", "largest force"), found, strict=True):
+            note(record_property, f"{what} of a ball and a sphere of triangles, over Hertz's [-]", f"{cells} cells a radius", value, 1.0)
     assert abs(fine[1] - 1) < 0.1
     assert abs(fine[1] - 1) < 0.5 * abs(coarse[1] - 1)
     assert abs(fine[0] - 1) < 0.15

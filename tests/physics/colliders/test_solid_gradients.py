@@ -7,6 +7,7 @@ from neuido.physics.colliders import Capsule, Cuboid, Cylinder, HalfSpace, Heigh
 from neuido.physics.laws.classical import FixedCorotated
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Keyframes, Plane, Scene, Walls
+from tests.physics.balances import note
 from tests.physics.bodies import DEVICE, cloud
 
 TURN = (0.9, 0.2, -0.3, 0.1)
@@ -98,7 +99,7 @@ class Problem:
 
 
 @pytest.mark.slow
-def test_gradients_equal_finite_differences():
+def test_gradients_equal_finite_differences(record_property):
     p = Problem()
     gradients = torch.autograd.grad(p.loss(), p.leaves())
     for name, t, gradient in zip(p.NAMES, p.leaves(), gradients, strict=True):
@@ -118,6 +119,7 @@ def test_gradients_equal_finite_differences():
                 t.sub_(shift * h * direction)
         numeric = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * h)
         analytic = float((gradient * direction).sum())
+        note(record_property, f"derivative along {name}", "solids of every kind and motion, two scenes", analytic, numeric)
         assert float(gradient.norm()) > 0, name
         assert abs(numeric - analytic) <= 2e-6 * max(abs(analytic), 1e-2 * float(gradient.norm() * direction.norm())), (
             f"{name}: {numeric:.9g} by differences, {analytic:.9g}"

@@ -12,6 +12,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import FixedCorotated
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Keyframes, Plane, Scene
+from tests.physics.balances import note
 from tests.physics.bodies import DEVICE, block, same
 from tests.physics.colliders.test_solid_gradients import icosahedron
 
@@ -42,21 +43,24 @@ def supports() -> dict:
 
 
 @pytest.mark.parametrize("kind", supports())
-def test_the_force_of_a_body_at_rest_is_its_weight(kind):
+def test_the_force_of_a_body_at_rest_is_its_weight(kind, record_property):
     body = block((0.35, 0.36, 0.35), (0.65, 0.51, 0.65), (6, 3, 6))
     scene = Scene(cells=12, dt=2e-3, walls=None, colliders=(supports()[kind],))
     sim, frames = run(scene, body, 600, 200, effects=Effects(viscosity_shear=100.0, viscosity_bulk=100.0))
     weight = float(sim.mass.sum()) * G
     force = frames.forces[-1, 0]
+    note(record_property, "force of a body at rest [N]", kind, -force[1], weight)
     assert abs(float(force[1]) + weight) < 0.01 * weight
     assert float(force[[0, 2]].norm()) < 0.01 * weight
     arm = (sim.mass[:, None] * frames.x[-1]).sum(0) / sim.mass.sum() - frames.colliders[0].poses[-1, :3, 3]
     expected = torch.linalg.cross(arm, torch.tensor([0.0, -weight, 0.0], dtype=torch.float64).to(arm))
-    assert float((frames.torques[-1, 0] - expected).norm()) < 0.01 * weight * 0.3
+    off = float((frames.torques[-1, 0] - expected).norm())
+    note(record_property, "torque of a body at rest, minus arm times weight, over weight times 0.3 m [-]", kind, off / (0.3 * weight), 0.0)
+    assert off < 0.01 * weight * 0.3
 
 
 @pytest.mark.parametrize(("friction", "slides"), [(0.2, True), (0.6, False)])
-def test_a_block_on_a_tilted_cuboid_obeys_the_friction_cone(friction, slides):
+def test_a_block_on_a_tilted_cuboid_obeys_the_friction_cone(friction, slides, record_property):
     angle = math.radians(20)
     turn = (math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2))
     up = torch.tensor([-math.sin(angle), math.cos(angle), 0.0], dtype=torch.float64)
@@ -71,10 +75,14 @@ def test_a_block_on_a_tilted_cuboid_obeys_the_friction_cone(friction, slides):
     speed = frames.v.cpu().mean(1) @ down
     if slides:
         expected = G * (math.sin(angle) - friction * math.cos(angle))
+        what = "acceleration of a block on a tilted cuboid, 20 degrees [m/s^2]"
+        note(record_property, what, f"friction {friction:g}", float(speed[-1] - speed[-2]) / 0.08, expected)
         assert abs(float(speed[-1] - speed[-2]) / 0.08 - expected) < 0.02 * expected
         pressed, dragged = frames.forces[-1, 0].cpu() @ up, frames.forces[-1, 0].cpu() @ down
+        note(record_property, "friction cone: drag over pressure [-]", f"friction {friction:g}", -dragged / pressed, friction)
         assert abs(float(dragged / pressed) + friction) < 0.01 * friction
     else:
+        note(record_property, "speed of a block that sticks on a tilted cuboid [m/s]", f"friction {friction:g}", speed[-1], 0.0)
         assert abs(float(speed[-1])) < 0.02 * G * math.sin(angle) * 0.32
 
 
@@ -86,7 +94,7 @@ def moments(sim, frames, k: int):
     return (m * v).sum(0), (torch.linalg.cross(x, m * v) + axial).sum(0)
 
 
-def test_an_off_centre_hit_of_a_free_ball_keeps_momentum_and_angular_momentum():
+def test_an_off_centre_hit_of_a_free_ball_keeps_momentum_and_angular_momentum(record_property):
     body = block((0.2, 0.1, 0.2), (0.8, 0.35, 0.8), (8, 4, 8))
     ball = Sphere(0.12, position=(0.6, 0.5, 0.45), velocity=(0.4, -1.0, 0.0), spin=(0.0, 0.0, 3.0), mass=3.0, friction=0.3)
     sim, frames = run(Scene(cells=12, dt=2e-3, walls=None, gravity=(0.0, 0.0, 0.0), colliders=(ball,)), body, 90, 30)
@@ -98,6 +106,9 @@ def test_an_off_centre_hit_of_a_free_ball_keeps_momentum_and_angular_momentum():
         total.append(torch.cat([p + 3.0 * v, L + torch.linalg.cross(place, 3.0 * v) + inertia * w]))
     assert float(found.velocity[-1, 1]) > 0.05  # it bounced
     assert abs(float(found.velocity[-1, 5]) - 3.0) > 0.1  # friction turned it
+    drift = (torch.stack(total) - total[0]).abs().amax(0)
+    for name, unit, part in (("momentum", "kg m/s", drift[:3]), ("angular momentum", "kg m^2/s", drift[3:])):
+        note(record_property, f"{name} of body and free ball [{unit}]", "off-centre hit with friction", part.max(), 0.0)
     for row in total[1:]:
         assert float((row - total[0]).abs().max()) < 1e-13
     assert torch.allclose(frames.forces.sum(0)[0] * 0.06, 3.0 * (found.velocity[-1, :3] - found.velocity[0, :3]), atol=1e-12)
@@ -128,7 +139,7 @@ AWAY = block((0.85, 0.85, 0.05), (0.95, 0.95, 0.15), (2, 2, 2))
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
-def test_free_spheres_collide_head_on_by_the_closed_form(restitution):
+def test_free_spheres_collide_head_on_by_the_closed_form(restitution, record_property):
     """v' = (p ± e m' v_rel) / M. Momentum, and an off-centre pair's angular momentum, are exact.
 
     A critically damped spring that never pulls lets go at v = -exp(-2) v_0, which is what no restitution comes to.
@@ -148,6 +159,14 @@ def test_free_spheres_collide_head_on_by_the_closed_form(restitution):
         assert float((p[1] - p[0]).norm()) < 1e-13 and float((L[1] - L[0]).norm()) < 1e-13
         speeds = [float(f.velocity[-1, 0]) for f in frames.colliders]
         if offset == 0.0:
+            for ball, exact in ((0, (1.5 - e * 1.5) / 3), (1, (1.5 + e * 3.0) / 3)):
+                note(
+                    record_property,
+                    f"velocity of free sphere {ball + 1} after a collision [m/s]",
+                    f"restitution {restitution:g}",
+                    speeds[ball],
+                    exact,
+                )
             assert speeds[0] == pytest.approx((1.5 - e * 1.0 * 1.5) / 3, abs=0.03)
             assert speeds[1] == pytest.approx((1.5 + e * 2.0 * 1.5) / 3, abs=0.06)
         else:

@@ -12,6 +12,7 @@ from neuido.physics.laws.classical import FixedCorotated, NeoHookean, Sigma
 from neuido.physics.mpm import reference
 from neuido.physics.mpm.simulator import Simulator
 from neuido.types import Body, Box, Plane, Scene
+from tests.physics.balances import note
 
 YOUNG, POISSON, RHO = 1e5, 0.3, 1000.0
 WAVE = math.sqrt(YOUNG * (1 - POISSON) / ((1 + POISSON) * (1 - 2 * POISSON)) / RHO)
@@ -44,7 +45,7 @@ def balls(contact="separate", cells=24, speed=0.5, ratio=1.0):
 
 
 @pytest.mark.parametrize("ratio", [1.0, 2.0])
-def test_balls_collide_head_on_by_the_closed_form(ratio):
+def test_balls_collide_head_on_by_the_closed_form(ratio, record_property):
     """v' = (p ± e m v_rel) / M; a grid of finite cells loses a part of the restitution e, less the finer it is."""
     restitution = []
     for cells in (16, 24):
@@ -58,6 +59,14 @@ def test_balls_collide_head_on_by_the_closed_form(ratio):
         total = float(momentum(sim, frames)[0, 0])
         assert float(left[-1]) == pytest.approx((total - own[1] * restitution[-1] * 1.0) / sum(own), abs=1e-9)
         assert momentum(sim, frames).sub(momentum(sim, frames)[0]).abs().max() < 1e-12
+        drift = momentum(sim, frames).sub(momentum(sim, frames)[0]).abs().max()
+        note(
+            record_property,
+            "momentum of a head-on collision [kg m/s]",
+            f"masses 1 : {ratio:g}, balls of {round(0.2 * cells)} cells",
+            drift,
+            0.0,
+        )
         energy = 0.5 * (sim.mass[:, None] * frames.v.square()).sum((1, 2))
         assert energy[-1] < energy[0]
     assert all(0.84 < e < 1 for e in restitution)  # balls of 3 and 5 cells
@@ -65,7 +74,7 @@ def test_balls_collide_head_on_by_the_closed_form(ratio):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1.0, 2.0])
-def test_what_a_collision_loses_is_of_first_order_in_the_cell(ratio):
+def test_what_a_collision_loses_is_of_first_order_in_the_cell(ratio, record_property):
     """Restitution of 1 is the limit: balls of 10 cells lose less than 0.6 of what those of 5 cells do."""
     lost = []
     for cells in (24, 48):
@@ -75,6 +84,15 @@ def test_what_a_collision_loses_is_of_first_order_in_the_cell(ratio):
             frames = sim.rollout(steps, every=steps)
         left, right = (velocity(sim, frames, body)[:, 0] for body in (0, 1))
         lost.append(1 - float(right[-1] - left[-1]) / float(left[0] - right[0]))
+        case = f"masses 1 : {ratio:g}, balls of {round(0.2 * cells)} cells across"
+        note(record_property, "restitution of elastic balls [-]", case, 1 - lost[-1], 1.0)
+        for name, speed, other in (
+            ("left", left[-1], sim.mass[frames.body == 1].sum()),
+            ("right", right[-1], -sim.mass[frames.body == 0].sum()),
+        ):
+            middle = float(momentum(sim, frames)[0, 0] / sim.mass.sum())
+            exact = middle - float(other / sim.mass.sum())
+            note(record_property, f"velocity after an elastic collision, {name} ball [m/s]", case, speed, exact)
     assert 0 < lost[1] < 0.6 * lost[0]
     assert lost[1] < 0.08
 
@@ -103,7 +121,7 @@ def block_on_slope(angle, friction):
 
 @pytest.mark.slow  # three runs of two seconds
 @pytest.mark.parametrize("friction", [0.0, 0.2, 0.5])
-def test_block_slides_on_a_slope_by_coulombs_law(friction):
+def test_block_slides_on_a_slope_by_coulombs_law(friction, record_property):
     """a = g (sin a - mu cos a), and rest for mu > tan a."""
     angle = math.radians(20.0)
     scene = block_on_slope(angle, friction)
@@ -115,13 +133,17 @@ def test_block_slides_on_a_slope_by_coulombs_law(friction):
     found = float((down[-1] - down[10]) / (frames.times[-1] - frames.times[10]))
     exact = 10.0 * (math.sin(angle) - friction * math.cos(angle))
     if exact > 0:
+        what = "acceleration of a block on the slope of another body, 20 degrees [m/s^2]"
+        note(record_property, what, f"friction {friction:g}", found, exact)
         assert found == pytest.approx(exact, rel=0.05)
     else:
+        what = "speed of a block that sticks on the slope of another body, 20 degrees [m/s]"
+        note(record_property, what, f"friction {friction:g}", down[-1], 0.0)
         assert abs(float(down[-1])) < 0.02
 
 
 @pytest.mark.slow  # half a minute
-def test_balls_that_are_pressed_together_approach_hertz():
+def test_balls_that_are_pressed_together_approach_hertz(record_property):
     """The largest force of a slow collision: Hertz for elastic spheres."""
     radius, speed, errors = 0.2, 0.25, []
     stiff, reduced, mass = YOUNG / (1 - POISSON**2) / 2, radius / 2, 0.5 * RHO * 4 / 3 * math.pi * radius**3
@@ -142,7 +164,8 @@ def test_balls_that_are_pressed_together_approach_hertz():
         force = -(v[1:] - v[:-1]) * own / scene.dt
         forces.append(float(torch.nn.functional.avg_pool1d(force[None, None], 9, 1, 4).max()))
         errors.append(abs(forces[-1] / hertz - 1))
-    assert max(errors) < 0.1  # balls of 8 and 12 cells a radius
+        note(record_property, "largest force of two balls [N]", f"{round(radius * cells * 2)} cells across", forces[-1], hertz)
+    assert max(errors) < 0.1  # balls of 8 and 12 cells across
 
 
 def stack(friction=0.3, third=False, contact="separate", **options):
@@ -161,18 +184,20 @@ def stack(friction=0.3, third=False, contact="separate", **options):
 
 @pytest.mark.parametrize("contact", ["separate", "sticky"])
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_momentum_is_kept_to_rounding(contact, friction):
+def test_momentum_is_kept_to_rounding(contact, friction, record_property):
     sim = simulator(stack(friction, True, contact, gravity=(0.0, 0.0, 0.0), walls=None))
     with torch.no_grad():
         frames = sim.rollout(60, every=20)
     total = momentum(sim, frames)
-    assert (total - total[0]).abs().max() < 1e-12
+    drift = (total - total[0]).abs().max()
+    note(record_property, "momentum of three rubbing bodies [kg m/s]", f"{contact}, friction {friction:g}", drift, 0.0)
+    assert drift < 1e-12
     assert (velocity(sim, frames, 1)[-1] - velocity(sim, frames, 1)[0]).norm() > 0.1
 
 
 @pytest.mark.parametrize("third", [False, True])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 5.0])
-def test_gradients_equal_finite_differences(friction, third):
+def test_gradients_equal_finite_differences(friction, third, record_property):
     """Positions, velocities, masses (densities) and friction; without friction from above, where the sliding branch begins."""
     sim = simulator(stack(friction, third))
     generator = torch.Generator().manual_seed(0)
@@ -199,10 +224,13 @@ def test_gradients_equal_finite_differences(friction, third):
 
             low = 0.0 if i == 3 and friction == 0.0 else -step
             difference = (at(step) - at(low)) / (step - low)
+            name = ("positions", "velocities", "masses", "friction of bodies")[i]
+            case = f"{3 if third else 2} bodies, friction {friction:g}"
+            note(record_property, f"derivative along {name}", case, (gradient * along).sum(), difference)
             assert float((gradient * along).sum()) == pytest.approx(float(difference), rel=1e-4, abs=1e-6)
 
 
-def test_gradient_of_a_modulus_field_equals_finite_differences():
+def test_gradient_of_a_modulus_field_equals_finite_differences(record_property):
     scene = stack()
     count = len(scene.bodies[1].x)
     young = torch.linspace(1e4, 3e4, count, dtype=torch.float64, requires_grad=True)
@@ -216,6 +244,7 @@ def test_gradient_of_a_modulus_field_equals_finite_differences():
     along = torch.cos(torch.arange(count, dtype=torch.float64))
     with torch.no_grad():
         difference = (loss(young + along) - loss(young - along)) / 2
+    note(record_property, "derivative along a field of moduli", "2 bodies", (gradient * along).sum(), difference)
     assert float((gradient * along).sum()) == pytest.approx(float(difference), rel=1e-5)
 
 
