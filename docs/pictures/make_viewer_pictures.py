@@ -171,7 +171,7 @@ def rendered(path: Path) -> None:
     )
     scene, body = drop(0.014, solids, 0.56)
     content = content_of_frames(moved(scene, body, 480), title="drop", scene=scene, law=LAW)
-    Image.fromarray(Painter(content, "strain", View(width=900, height=600)).picture(26)).save(path, quality=82)
+    Image.fromarray(Painter(content, "speed", View(width=900, height=600)).picture(20)).save(path, quality=82)
 
 
 def photograph(browser: object, url: str, path: Path, settle: float = 25.0, act: Callable[[], None] = lambda: None) -> None:
