@@ -94,7 +94,10 @@ class TinyScenes(LightningDataModule):
 
     @cached_property
     def scenes(self):
-        return [tiny_scene(self.folder, f"tiny-{i}", young=young) for i, young in enumerate(self.youngs)]
+        own = slice(None)
+        if self.trainer is not None and getattr(self.trainer.strategy, "scenes_apart", False):
+            own = slice(self.trainer.global_rank, None, self.trainer.world_size)
+        return [tiny_scene(self.folder, f"tiny-{i}", young=young) for i, young in list(enumerate(self.youngs))[own]]
 
     @cached_property
     def unseen(self):
@@ -106,7 +109,7 @@ class TinyScenes(LightningDataModule):
 
     def train_dataloader(self):
         if self.steps_in_a_row is not None:
-            return SequentialScenes(self.scenes, steps=self.steps_in_a_row)
+            return SequentialScenes(self.scenes, steps=self.steps_in_a_row, total=len(self.youngs))
         return ShuffledScenes(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self):
@@ -121,4 +124,6 @@ class TinyScenes(LightningDataModule):
         return batch
 
     def _share(self):
-        return {} if self.trainer is None else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
+        if self.trainer is None or getattr(self.trainer.strategy, "scenes_apart", False):
+            return {}
+        return {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}

@@ -71,17 +71,23 @@ class ShuffledScenes(ResumableLoader[VisualScene]):
 
 
 class SequentialScenes(ResumableLoader[VisualScene]):
-    """Resumable loader whose epoch e repeats scene e for `steps` steps."""
+    """Resumable loader whose epoch e repeats scene e for `steps` steps, or the last scene where other processes have more.
 
-    def __init__(self, scenes: Sequence[VisualScene], *, steps: int) -> None:
-        super().__init__({"scenes": len(scenes), "steps": steps})
+    Args:
+        scenes: The scenes of this process.
+        steps: Steps of each scene.
+        total: Number of scenes of all processes, which must be equal when a run is resumed; that of `scenes` where absent.
+    """
+
+    def __init__(self, scenes: Sequence[VisualScene], *, steps: int, total: int | None = None) -> None:
+        super().__init__({"scenes": len(scenes) if total is None else total, "steps": steps})
         self.scenes, self.steps = list(scenes), steps
 
     def __len__(self) -> int:
         return self.steps
 
     def batches(self, epoch: int, start: int) -> Iterable[VisualScene]:
-        return [self.scenes[epoch]] * (self.steps - start) if epoch < len(self.scenes) else []
+        return [self.scenes[min(epoch, len(self.scenes) - 1)]] * (self.steps - start)
 
 
 def select_training_views(batch: MultiViewBatch, views: int | list[int]) -> MultiViewBatch:
@@ -111,7 +117,8 @@ def select_training_views(batch: MultiViewBatch, views: int | list[int]) -> Mult
 class VisualDataModule(LightningDataModule):
     """Lightning data module of filmed bodies, each with the output of `neuido reconstruct`.
 
-    Training and validation use `scenes`; test and predict use `scenes` and `unseen`. Several processes share the scenes.
+    Training and validation use `scenes`; test and predict use `scenes` and `unseen`. Several processes share the scenes: each batch is of
+    one of them, or, with the strategy `scenes` of an adaptation, each process opens some of the scenes alone.
 
     Args:
         scenes: Folders, or mappings with `path` and options of `load_visual_scene`: `reconstruction`, `recording`, `views`,
@@ -153,12 +160,12 @@ class VisualDataModule(LightningDataModule):
 
     @cached_property
     def scenes(self) -> list[VisualScene]:
-        """Scenes that training uses."""
+        """Scenes that training uses, in this process."""
         return self._all(self.given, "data.scenes")
 
     @cached_property
     def unseen(self) -> list[VisualScene]:
-        """Scenes that training does not use."""
+        """Scenes that training does not use, in this process."""
         return self._all(self.given_unseen, "data.unseen")
 
     @property
@@ -176,7 +183,7 @@ class VisualDataModule(LightningDataModule):
 
     def train_dataloader(self) -> ShuffledScenes | SequentialScenes:
         if self.steps_in_a_row is not None:
-            return SequentialScenes(self.scenes, steps=self.steps_in_a_row)
+            return SequentialScenes(self.scenes, steps=self.steps_in_a_row, total=len(self.given))
         return ShuffledScenes(self.scenes, seed=self.seed, **self._share())
 
     def val_dataloader(self) -> DataLoader:
@@ -186,7 +193,12 @@ class VisualDataModule(LightningDataModule):
         return ordered_loader([*self.scenes, *self.unseen], **self._share())
 
     def _share(self) -> dict[str, int]:
-        return {} if self.trainer is None else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
+        """Return the share of this process in the scenes that it has opened."""
+        return {} if self.trainer is None or self._apart() else {"rank": self.trainer.global_rank, "ranks": self.trainer.world_size}
+
+    def _apart(self) -> bool:
+        """Return whether each process opens scenes of its own."""
+        return self.trainer is not None and getattr(self.trainer.strategy, "scenes_apart", False)
 
     def predict_dataloader(self) -> DataLoader:
         return self.test_dataloader()
@@ -200,7 +212,8 @@ class VisualDataModule(LightningDataModule):
         return batch
 
     def _all(self, given: list[str | dict[str, Any]], where: str) -> list[VisualScene]:
-        scenes = [self._open(each, f"{where}[{i}]") for i, each in enumerate(given)]
+        own = slice(self.trainer.global_rank, None, self.trainer.world_size) if self.trainer is not None and self._apart() else slice(None)
+        scenes = [self._open(each, f"{where}[{i}]") for i, each in list(enumerate(given))[own]]
         if self.training_views is None:
             return scenes
         return [scene._replace(batch=select_training_views(scene.batch, self.training_views)) for scene in scenes]

@@ -23,7 +23,6 @@ from neuido.models.inference.transfer import read_conditions, run_condition
 from neuido.models.scoring import motion_scores as scores
 from neuido.models.stages.image_module import (
     SCORES,
-    ImageModule,
     check_options,
     curriculum_frames,
     image_losses,
@@ -32,17 +31,19 @@ from neuido.models.stages.image_module import (
     write_frame_scores,
     write_prediction,
 )
+from neuido.models.stages.scene_ranks import SharesScenes
 from neuido.models.stages.training import gradients_of, is_finite
 from neuido.types import ParticleState
 
 GIGABYTE = 1e9
 
 
-class AdaptModule(ImageModule):
+class AdaptModule(SharesScenes):
     """Fit a method to each scene separately, and score it on held-out views before and after.
 
     One epoch is one scene; leave `trainer.max_epochs` at -1. The loss is that of Stage II (`image_losses`), and the data module is a
     `VisualDataModule`. `out/scores.csv` has two rows for each scene, whose `stage` is before and after. `out/<scene>/fit` holds the fit.
+    Several processes share the scenes with the strategy `scenes` (`SceneRanks`).
 
     Args:
         method: The method to fit (`fewshot.method`).
@@ -136,7 +137,8 @@ class AdaptModule(ImageModule):
         self._names: list[str] = []
         self._current: tuple[str, PreparedScene] | None = None
         self._progress: dict[str, Progress] = {}
-        self._rows: list[dict[str, Any]] = []
+        self._idle = False
+        """Whether the scene of this step is done while those of other processes are not."""
         self._predicted: list[tuple[PreparedScene, Laws]] = []
 
     # Scenes.
@@ -158,11 +160,9 @@ class AdaptModule(ImageModule):
     def setup(self, stage: str) -> None:
         if stage != "fit" or len(self.fits):
             return
-        if self.trainer.world_size > 1:
-            raise UserError(f"trainer.devices: adaptation runs in one process, not in {self.trainer.world_size}; use several runs")
         data = self.trainer.datamodule
+        self.trainer.fit_loop.max_epochs = self.share_scenes([scene.name for scene in data.scenes])
         data.steps_in_a_row = self.ahead + self.steps
-        self.trainer.fit_loop.max_epochs = len(data.scenes)
         for scene in data.scenes:
             prepared = self.open_scene(scene, self.trainer.strategy.root_device, watched=True)
             self._training_views(prepared)
@@ -208,10 +208,13 @@ class AdaptModule(ImageModule):
             elif scene.name in self._progress and self._progress[scene.name].done:  # killed between the last step and the scores
                 self._begin(scene)
                 self._finish_scene()
+        self.publish()
 
     def on_train_batch_start(self, batch: VisualScene, batch_idx: int) -> int | None:
-        self._begin(batch)
-        return -1 if self._progress[batch.name].done else None
+        self._idle = batch.name in self._progress and self._progress[batch.name].done
+        if not self._idle:
+            self._begin(batch)
+        return -1 if self.trainer.strategy.reduce_boolean_decision(self._idle) else None
 
     def _begin(self, scene: VisualScene) -> PreparedScene:
         """Prepare a scene on the device, and score it before its first step."""
@@ -228,6 +231,8 @@ class AdaptModule(ImageModule):
         return self._current[1]
 
     def training_step(self, scene: VisualScene, batch_idx: int) -> Tensor:
+        if self._idle:
+            return torch.zeros((), device=self.device, requires_grad=True)
         prepared, fit, step = self._begin(scene), self.fit_of(scene.name), self._progress[scene.name].steps
         frames = self.rollout_frames(prepared, step)
         motion = self._rollout_or_restore(prepared, fit, frames)
@@ -280,6 +285,9 @@ class AdaptModule(ImageModule):
                 self._progress[name].restore_last_good(self.fit_of(name), ran=True)
 
     def optimizer_step(self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Any = None) -> None:
+        if self._idle:
+            optimizer_closure()
+            return
         name, prepared = self._current  # type: ignore[misc]
         progress = self._progress[name]
         self._set_rates(optimizer, name, progress)
@@ -317,9 +325,11 @@ class AdaptModule(ImageModule):
 
     def on_train_epoch_end(self) -> None:
         self._finish_scene()
+        self.publish()
 
     def on_train_end(self) -> None:
         self._finish_scene()
+        self.publish()
         self._report_missing_lpips()
 
     def _finish_scene(self) -> None:
@@ -353,9 +363,7 @@ class AdaptModule(ImageModule):
         if stage == "after":
             keys = ("steps", "seconds", "peak_memory_gb", "warp_memory_gb") if self.device.type == "cuda" else ("steps", "seconds")
             row |= {key: getattr(self._progress[name], key) for key in keys}
-        self._rows.append(row | self.score(prepared, fit, stage))
-        write_rows(Path(self.hparams.out) / "scores.csv", self._rows)
-        self._show(self._rows[-1])
+        self.record(row | self.score(prepared, fit, stage))
 
     def score(self, prepared: PreparedScene, fit: SceneFit, stage: str) -> dict[str, Any]:
         """Return the mean scores of a fit and its parameters; write the scores of each frame to `out/<scene>/<stage>`."""
@@ -371,22 +379,13 @@ class AdaptModule(ImageModule):
             figures |= {f"later_{key}": value for key, value in later.items()}
         return {**figures, "halvings": halvings, **found}
 
-    def _show(self, row: dict[str, Any]) -> None:
-        shown = [f"{key} {row[key]:.4g}" for key in (*SCORES, "later_iou", "steps", "seconds", "peak_memory_gb") if key in row]
-        self.print(f"{row['scene']:16s} {row['stage']:7s} {', '.join(shown)}{row.get('failed', '')}")
-
     # Checkpoints.
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        progress = {name: progress.state() for name, progress in self._progress.items()}
-        checkpoint["adaptation"] = {"progress": progress, "rows": self._rows}
+        self.keep_all(checkpoint, {name: progress.state() for name, progress in self._progress.items()})
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        kept = checkpoint.get("adaptation")
-        if kept is None:
-            raise UserError("ckpt_path is no checkpoint of an adaptation")
-        self._progress = {name: Progress(**state) for name, state in kept["progress"].items()}
-        self._rows = kept["rows"]
+        self._progress = {name: Progress(**state) for name, state in self.take_own(checkpoint).items()}
 
     # Test and prediction, from a saved fit.
 
@@ -414,13 +413,14 @@ class AdaptModule(ImageModule):
         prepared, fit = self.load_fit(scene)
         row = {"scene": scene.name, "method": type(self.plan).__name__, "stage": "test", **self.score(prepared, fit, "test")}
         self._rows.append(row)
-        self._show(row)
+        self.show(row)
 
     def on_test_epoch_end(self) -> None:
-        rows, self._rows = self._rows, []
+        rows, self._rows = self.rows_of_all(), []
         self.log_dict({f"test/{name}": value for name, value in scores.mean_of(rows, SCORES).items()})
-        write_rows(Path(self.hparams.out) / "test.csv", rows)
-        self._report_missing_lpips()
+        if self.trainer.is_global_zero:
+            write_rows(Path(self.hparams.out) / "test.csv", rows)
+            self._report_missing_lpips()
 
     @without_gradients
     def predict_step(self, scene: VisualScene, batch_idx: int) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from neuido.models.stages.image_module import (
     write_frame_scores,
     write_prediction,
 )
+from neuido.models.stages.scene_ranks import gathered
 from neuido.models.stages.training import open_operator_and_encoder, optimiser_steps, report_and_save
 
 GRAPHED = 24
@@ -65,6 +66,7 @@ class AlignModule(ImageModule):
             paper: 0.
         segment: Gradient checkpointing: keep the state of a rollout only every so many frames (`Simulator.rollout`); 0: keep all.
         cache: Folder for cached optical flow.
+        flow_method: `opencv` (on the CPU), or `parallel`, the same algorithm for all frames at once on the device of the training.
         save_to: File for the encoder at the end of a fit.
         out: Folder for the results of test and predict.
         lpips_backbone: Local file with the weights of VGG16 or AlexNet; without one, LPIPS is not reported.
@@ -100,6 +102,7 @@ class AlignModule(ImageModule):
         plausibility_weight: float = 1.0,
         segment: int = 0,
         cache: str | None = None,
+        flow_method: Literal["opencv", "parallel"] = "opencv",
         save_to: str | None = None,
         out: str = "runs/stage2/results",
         lpips_backbone: str | None = None,
@@ -128,7 +131,7 @@ class AlignModule(ImageModule):
     def prepared(self, scene: VisualScene) -> PreparedScene:
         """Return the prepared scene, from the cache after the first call."""
         if scene.name not in self._prepared:
-            options = {"encoder_views": self.hparams.encoder_views, "cache": self.hparams.cache, "graphs": self._few_scenes()}
+            options = {name: self.hparams[name] for name in ("encoder_views", "cache", "flow_method")} | {"graphs": self._few_scenes()}
             self._prepared[scene.name] = prepare(scene, self.encoder, device=self.device, **options)
         return self._prepared[scene.name]
 
@@ -211,11 +214,7 @@ class AlignModule(ImageModule):
 
     def _gather(self) -> list[dict[str, Any]]:
         """Gather the rows of all processes, one for each scene in the order of the names, and clear the local rows."""
-        rows, self._rows = self._rows, []
-        if self.trainer.world_size > 1:
-            everyone: list[Any] = [None] * self.trainer.world_size
-            torch.distributed.all_gather_object(everyone, rows)
-            rows = [row for part in everyone for row in part]
+        rows, self._rows = [row for part in gathered(self._rows) for row in part], []
         return sorted({row["scene"]: row for row in rows}.values(), key=lambda row: row["scene"])
 
     # Test: all scores, with baselines for unseen scenes.

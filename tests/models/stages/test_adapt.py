@@ -1,12 +1,6 @@
 """Few-shot adaptation: it improves what was held out, scene after scene, and a killed run goes on where it was."""
 
-import csv
 import itertools
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +22,8 @@ from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.models.stages.adapt import AdaptModule
 from neuido.models.stages.image_module import image_losses
 from neuido.physics.effects.parameters import Effects
+from tests.models.stages.adaptation_runs import finish, kill_after, losses, rows_of, start
 from tests.models.visual_samples import TinyScenes, tiny_scene
-from tests.waiting import HANGS, wait_for
-
-ROOT = Path(__file__).parents[3]
 
 
 def module(tmp_path, *, start="mean", **options):
@@ -44,10 +36,6 @@ def trainer(tmp_path, **options):
     options = {"logger": False, "enable_checkpointing": False, "num_sanity_val_steps": 0, "limit_val_batches": 0, **options}
     options = {"max_epochs": -1, "gradient_clip_val": 1.0, **options}
     return Trainer(accelerator="cpu", default_root_dir=tmp_path, enable_progress_bar=False, enable_model_summary=False, **options)
-
-
-def rows_of(path):
-    return list(csv.DictReader(path.open()))
 
 
 @pytest.mark.slow
@@ -399,66 +387,6 @@ def test_impossible_runs_are_named(tmp_path):
     fine = replace(scene.scene, dt=0.0171)
     steps = interval / prepare(scene._replace(scene=fine), None).source.scene.dt
     assert steps == pytest.approx(round(steps)), "the step adapts to the frame rate"
-
-
-SCRIPT = """
-import sys, time
-import torch
-from lightning.pytorch import Callback, Trainer, seed_everything
-from lightning.pytorch.callbacks import ModelCheckpoint
-from neuido.models.stages.adapt import AdaptModule
-from neuido.models.fewshot.low_rank import LowRankAdaptation
-from tests.models.visual_samples import TinyScenes
-
-torch.set_num_threads(1)
-out, pause, resume = sys.argv[1], float(sys.argv[2]), sys.argv[3]
-
-class Record(Callback):
-    def on_train_batch_end(self, trainer, module, outputs, batch, index):
-        with open(f"{out}/losses.txt", "a") as file:
-            print(batch.name, index, f"{float(outputs['loss']):.9g}", file=file)
-        time.sleep(pause)
-
-if __name__ == "__main__":
-    seed_everything(0)
-    method = LowRankAdaptation(start="mean", latent_lr=0.03)
-    model = AdaptModule(method, steps=4, curriculum=[0.5], views_per_step=1, out=f"{out}/out", stop_on="loss", check_every=2)
-    keep = ModelCheckpoint(dirpath=out, save_last=True, save_top_k=0, every_n_train_steps=1)
-    options = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "num_sanity_val_steps": 0}
-    options |= {"limit_val_batches": 0, "gradient_clip_val": 1.0, "max_epochs": -1}
-    trainer = Trainer(accelerator="cpu", devices=1, callbacks=[Record(), keep], **options)
-    trainer.fit(model, TinyScenes(out), ckpt_path=None if resume == "no" else resume, weights_only=True)
-"""
-
-
-def start(folder, pause=0.0, resume="no"):
-    folder.mkdir(exist_ok=True)
-    script = folder / "run.py"
-    script.write_text(SCRIPT)
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
-    arguments = [sys.executable, str(script), str(folder), str(pause), resume]
-    return subprocess.Popen(arguments, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def finish(process):
-    printed, _ = process.communicate(timeout=HANGS)
-    assert process.returncode == 0, printed[-3000:]
-
-
-def losses(folder):
-    path = folder / "losses.txt"
-    rows = [line.split() for line in path.read_text().splitlines()] if path.is_file() else []
-    return {(name, int(index)): float(loss) for name, index, loss in rows}
-
-
-def kill_after(process, folder, steps):
-    """Kill a run in the pause after so many steps, whose checkpoint is written."""
-    wait_for(lambda: len(losses(folder)) >= steps, process)
-    time.sleep(0.3)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL and steps <= len(losses(folder)) < 8
 
 
 @pytest.mark.slow
