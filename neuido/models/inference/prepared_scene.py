@@ -112,6 +112,7 @@ def prepare(
     device: str | torch.device = "auto",
     encoder_views: int = 0,
     cache: str | os.PathLike | None = None,
+    flow_method: str = "opencv",
     graphs: bool = True,
 ) -> PreparedScene:
     """Prepare a scene on a device: bind its Gaussians to the particles and embed its flow.
@@ -122,6 +123,7 @@ def prepare(
         device: `auto` (CUDA where available), `cpu`, `cuda`, or a torch device.
         encoder_views: Number of training views for the encoder, starting with the first; 0: all.
         cache: Folder for cached optical flow.
+        flow_method: `opencv`, or `parallel` on the device of the encoder (`flow.optical_flow`).
         graphs: As of `Simulator`; the graphs of hundreds of scenes take more memory than a GPU has.
 
     Raises:
@@ -139,7 +141,8 @@ def prepare(
     begun = time.perf_counter()
     if encoder is not None:
         with torch.no_grad():
-            velocities = encoder.measure_flow(batch, training[: encoder_views or None], scene.body.x.mean(0), cache=cache)
+            views = training[: encoder_views or None]
+            velocities = encoder.measure_flow(batch, views, scene.body.x.mean(0), cache=cache, method=flow_method)
             volume, conditions = (t.to(device) for t in encoder.embed(velocities))
     flow_seconds = time.perf_counter() - begun
     simulator = Simulator(scene.scene, scene.body, density=scene.density, device=device, graphs=graphs)

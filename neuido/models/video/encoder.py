@@ -218,7 +218,13 @@ class DynamicsEncoder(nn.Module):
         return volume.to(like), scale_conditions(interval, cell.to(like.device)).to(like)
 
     def measure_flow(
-        self, batch: MultiViewBatch, views: Sequence[int], centre: Tensor, *, cache: str | os.PathLike | None = None
+        self,
+        batch: MultiViewBatch,
+        views: Sequence[int],
+        centre: Tensor,
+        *,
+        cache: str | os.PathLike | None = None,
+        method: str = "opencv",
     ) -> Velocities:
         """Measure the velocities in the given views of a scene.
 
@@ -227,10 +233,12 @@ class DynamicsEncoder(nn.Module):
             views: Indices of the views.
             centre: Centre of the body [m], (3,).
             cache: Folder for cached optical flow.
+            method: `opencv`, or `parallel` on the device of the encoder (`flow.optical_flow`).
         """
         views = list(views)
         cameras = batch.cameras._replace(viewmats=batch.cameras.viewmats[views], Ks=batch.cameras.Ks[views])
-        options = {"size": self.flow["flow_size"], "preset": self.flow["flow_preset"], "cache": cache}
+        options = {"size": self.flow["flow_size"], "preset": self.flow["flow_preset"], "cache": cache, "method": method}
+        options["device"] = next(self.projector.parameters()).device
         images, masks = (
             [t[v] for v in views] for t in (batch.images, batch.masks)
         )  # views of the memory: a copy takes as long as the flow

@@ -1,7 +1,8 @@
 """Optical flow, and its encoding as three-channel images for the video encoder (paper, "Branch Network").
 
-The flow is computed by dense inverse search (DIS) of OpenCV. The default encoding preserves the magnitude, because speed is the cue for
-stiffness. The colour wheel of Tora, which is normalised frame by frame and loses the magnitude, is an option.
+The flow is computed by dense inverse search (DIS): by OpenCV, or of all frames of all videos at once by `parallel_flow`, on a GPU too.
+The default encoding preserves the magnitude, because speed is the cue for stiffness. The colour wheel of Tora, which is normalised frame by
+frame and loses the magnitude, is an option.
 """
 
 import hashlib
@@ -22,6 +23,7 @@ from neuido.data.cameras import refuse_moving
 from neuido.data.files.parsing import read_arrays
 from neuido.data.files.writing import write_arrays
 from neuido.errors import UserError
+from neuido.models.video.parallel_flow import parallel_flow
 from neuido.types import Cameras
 
 PRESETS = {
@@ -30,28 +32,41 @@ PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 ENCODINGS = ("velocity", "wheel")
+METHODS = ("opencv", "parallel")
+GREY = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in the brightness."""
 cv2.setNumThreads(1)  # videos are processed in parallel; threads within an image would compete
 
 SECTORS = (15, 6, 4, 11, 13, 6)
 """Number of hues of the Middlebury colour wheel from red to yellow, green, cyan, blue, magenta and back (Baker et al. 2011)."""
 
 
-def optical_flow(images: Tensor | Sequence[Tensor], *, preset: str = "medium", threads: int | None = None) -> Tensor:
+def optical_flow(
+    images: Tensor | Sequence[Tensor],
+    *,
+    preset: str = "medium",
+    threads: int | None = None,
+    method: str = "opencv",
+    device: str | torch.device | None = None,
+) -> Tensor:
     """Compute the dense flow from each frame to the next [px per frame] by DIS.
 
     Args:
         images: RGB in [0, 1], (..., T, H, W, 3), T >= 2; or videos (T, H, W, 3) of one shape, which need no copy in one place.
         preset: `ultrafast`, `fast` or `medium`.
         threads: Number of threads; the number of cores where absent.
+        method: `opencv` (on the CPU), or `parallel` (`parallel_flow`, which agrees with it to a hundredth of the motion).
+        device: Device for `parallel`; that of the images where absent.
 
     Returns:
-        Flow (..., T - 1, H, W, 2), float32 on the CPU; x points right, y down.
+        Flow (..., T - 1, H, W, 2), float32; x points right, y down. On the CPU, or on the device of `parallel`.
 
     Raises:
-        UserError: There are fewer than two frames, images are smaller than 16 pixels, or the preset is unknown.
+        UserError: There are fewer than two frames, images are smaller than 16 pixels, or the preset or the method is unknown.
     """
-    if preset not in PRESETS:
-        raise UserError(f"flow preset = {preset!r}; one of {', '.join(PRESETS)}")
+    for name, value, known in (("preset", preset, PRESETS), ("method", method, METHODS)):
+        if value not in known:
+            raise UserError(f"flow {name} = {value!r}; one of {', '.join(known)}")
     leading = images.shape[:-4] if isinstance(images, Tensor) else (len(images),)
     if isinstance(images, Tensor):
         videos = list(images.detach().reshape(-1, *images.shape[-4:])) if images.ndim > 3 else [images]
@@ -62,22 +77,45 @@ def optical_flow(images: Tensor | Sequence[Tensor], *, preset: str = "medium", t
         raise UserError(f"flow needs videos (..., T, H, W, 3) of at least 2 frames, got {(*leading, *first.shape)}")
     if min(first.shape[1:3]) < 16:
         raise UserError(f"flow needs images of at least 16 pixels a side, got {first.shape[2]} x {first.shape[1]}")
-    weights = first.new_tensor([0.299, 0.587, 0.114])
+    workers = threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        grey = _brightness(videos, pool)
+        if method == "parallel":
+            flow = parallel_flow(grey.to(first.device if device is None else device), preset)
+        else:
+            flow = _pairwise(grey.cpu().numpy(), preset, pool, workers)
+    return flow.view(*leading, len(first) - 1, *first.shape[1:3], 2)
 
-    def grey_of(frames: Tensor) -> np.ndarray:
-        return (255 * (frames @ weights)).round().clamp(0, 255).to(torch.uint8).cpu().numpy()
 
-    def pairs(part: tuple[np.ndarray, int, int]) -> list[np.ndarray]:
-        grey, first, last = part
+def _brightness(videos: list[Tensor], pool: ThreadPoolExecutor) -> Tensor:
+    """Return the brightness of V videos in bytes, (V, T, H, W) uint8, on their device; on the CPU frame by frame in several threads."""
+    first = videos[0]
+    weights, out = first.new_tensor(GREY), torch.empty((len(videos), *first.shape[:-1]), dtype=torch.uint8, device=first.device)
+
+    def convert(frames: Tensor, into: Tensor) -> None:
+        into.copy_((255 * (frames @ weights)).round().clamp(0, 255))
+
+    if first.is_cuda:
+        for video, part in zip(videos, out):
+            convert(video, part)
+    else:
+        frames = [(frame, own) for video, part in zip(videos, out) for frame, own in zip(video, part)]
+        list(pool.map(lambda pair: convert(*pair), frames))
+    return out
+
+
+def _pairwise(grey: np.ndarray, preset: str, pool: ThreadPoolExecutor, workers: int) -> Tensor:
+    """Return the flow of OpenCV's DIS, (V (T - 1), H, W, 2), of bytes (V, T, H, W), with some pairs of frames in each task."""
+    count = grey.shape[1] - 1
+    share = max(1, count * len(grey) // (2 * workers))  # about two tasks a thread
+
+    def pairs(part: tuple[np.ndarray, int]) -> list[np.ndarray]:
+        video, first = part
         search = cv2.DISOpticalFlow_create(PRESETS[preset])
-        return [search.calc(a, b, None) for a, b in zip(grey[first:last], grey[first + 1 : last + 1])]
+        return [search.calc(a, b, None) for a, b in zip(video[first : first + share], video[first + 1 : min(first + share, count) + 1])]
 
-    count, workers = len(first) - 1, threads or os.cpu_count() or 1
-    share = max(1, count * len(videos) // (2 * workers))  # pairs of frames of a task: about two tasks a thread
-    with ThreadPoolExecutor(workers) as pool:  # OpenCV releases the GIL
-        parts = [(grey, k, min(k + share, count)) for grey in pool.map(grey_of, videos) for k in range(0, count, share)]
-        flows = np.stack([flow for found in pool.map(pairs, parts) for flow in found])
-    return torch.from_numpy(flows).view(*leading, count, *flows.shape[1:])
+    parts = [(video, k) for video in grey for k in range(0, count, share)]
+    return torch.from_numpy(np.stack([flow for found in pool.map(pairs, parts) for flow in found]))  # OpenCV releases the GIL
 
 
 class Velocities(NamedTuple):
@@ -124,6 +162,8 @@ def measure_velocities(
     preset: str = "medium",
     cache: str | os.PathLike | None = None,
     threads: int | None = None,
+    method: str = "opencv",
+    device: str | torch.device | None = None,
 ) -> Velocities:
     """Measure the velocities in videos within a square around the body, masked by its silhouette.
 
@@ -136,7 +176,7 @@ def measure_velocities(
         size: Number of cells S along each side.
         preset: As in `optical_flow`.
         cache: Folder for cached flow, under a key of all inputs that affect it; no cache where absent.
-        threads: As in `optical_flow`.
+        threads, method, device: As in `optical_flow`.
 
     Raises:
         UserError: As in `optical_flow`, `pixel_length` and `frame_interval_of`.
@@ -144,18 +184,18 @@ def measure_velocities(
     interval, pixel = frame_interval_of(times), pixel_length(cameras, centre)
     path = None
     if cache is not None:
-        key = hashlib.sha256(repr(((len(images), *images[0].shape), preset, size)).encode())
+        key = hashlib.sha256(repr(((len(images), *images[0].shape), preset, size, *([] if method == "opencv" else [method]))).encode())
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for part in pool.map(lambda video: as_bytes(video[None]).cpu().numpy(), [*images, *masks]):
                 key.update(part)
         path = Path(cache) / f"flow-{key.hexdigest()[:24]}.npz"
     found = _read_cache(path)
     if found is None:
-        found = _crop_flow(optical_flow(images, preset=preset, threads=threads), masks, size)
+        found = _crop_flow(optical_flow(images, preset=preset, threads=threads, method=method, device=device), masks, size)
         if path is not None:
-            write_arrays(path, {"flow": found[0].numpy(), "side": found[1].numpy()}, compressed=False)
+            write_arrays(path, {"flow": found[0].cpu().numpy(), "side": found[1].numpy()}, compressed=False)
     flow, side = found
-    return Velocities(flow * (pixel / interval)[:, None, None, None, None], pixel * side / size, interval)
+    return Velocities(flow * (pixel / interval).to(flow.device)[:, None, None, None, None], pixel * side / size, interval)
 
 
 def as_bytes(images: Tensor) -> Tensor:
@@ -183,11 +223,11 @@ def as_bytes(images: Tensor) -> Tensor:
 def _crop_flow(flow: Tensor, masks: Tensor | Sequence[Tensor], size: int) -> tuple[Tensor, Tensor]:
     """Return the masked flow (V, T - 1, S, S, 2) in pixels of the full image, and the sides of the windows [px], (V,)."""
     out, sides = [], []
-    for each, mask in zip(flow, masks):
-        mask = mask.cpu()
-        top, left, side = body_window(mask)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        windows = list(pool.map(body_window, masks))
+    for each, mask, (top, left, side) in zip(flow, masks, windows):
         cut = (slice(None), slice(top, top + side), slice(left, left + side))
-        part = (each[cut] * mask[:-1][cut][..., None]).permute(0, 3, 1, 2)
+        part = (each[cut] * mask[:-1][cut].to(each.device)[..., None]).permute(0, 3, 1, 2)
         out.append(torch.nn.functional.interpolate(part, size=(size, size), mode="bilinear", antialias=True).permute(0, 2, 3, 1))
         sides.append(float(side))
     return torch.stack(out), torch.tensor(sides)

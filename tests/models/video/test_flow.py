@@ -48,12 +48,50 @@ def test_flow_of_several_videos_is_that_of_each():
     assert torch.equal(together[1], optical_flow(videos[1]))
 
 
+@pytest.mark.parametrize(("preset", "worst"), [("medium", 0.1), ("fast", 0.15), ("ultrafast", 0.2)])
+def test_flow_of_all_pairs_at_once_is_that_of_opencv(preset, worst):
+    videos = [shifted((1.5, -0.75)), shifted((-0.5, 2.5))]
+    pairwise, parallel = (optical_flow(videos, preset=preset, method=method) for method in ("opencv", "parallel"))
+    inside = (slice(None), slice(None), slice(16, -16), slice(16, -16))
+    assert parallel.shape == pairwise.shape and (parallel - pairwise)[inside].norm(dim=-1).mean() < worst
+    true = torch.tensor([[1.5, -0.75], [-0.5, 2.5]])[:, None, None, None]
+    assert (parallel - true)[inside].norm(dim=-1).mean() < worst
+    alone = optical_flow(videos[1], preset=preset, method="parallel")
+    assert torch.equal(parallel[1], alone)  # no pair reaches over the end of its video
+
+
+def test_flow_at_once_bends_as_that_of_opencv():
+    """A rotation and a growth about a point, whose flow changes from pixel to pixel."""
+    centre, image = 47.5, texture()
+    turn = cv2.getRotationMatrix2D((centre, centre), 3.0, 1.03)
+    video = torch.from_numpy(np.stack([image, cv2.warpAffine(image, turn, (96, 96), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)]))
+    video = (video - video.min()) / (video.max() - video.min())
+    y, x = np.mgrid[:96, :96]
+    true = torch.from_numpy(
+        np.stack([turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] - x, turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] - y], -1)
+    )
+    errors = [(optical_flow(video, method=method)[0] - true)[16:-16, 16:-16].norm(dim=-1).mean() for method in ("opencv", "parallel")]
+    assert errors[1] < 1.2 * errors[0] and errors[1] < 0.1 * true[16:-16, 16:-16].norm(dim=-1).mean()
+
+
+def test_velocities_by_both_methods_agree(tmp_path):
+    video = shifted((1.0, 0.5))[None]
+    masks = torch.zeros(1, 4, 96, 96)
+    masks[:, :, 20:70, 20:70] = 1
+    arguments = (video, masks, torch.arange(4) * 0.01, orbit(1, width=96, height=96), torch.tensor([0.5, 0.4, 0.5]))
+    one, other = (measure_velocities(*arguments, size=16, cache=tmp_path, method=method) for method in ("opencv", "parallel"))
+    assert len(list(tmp_path.glob("flow-*.npz"))) == 2  # one is not taken for the other
+    assert torch.equal(one.cell, other.cell)
+    assert (one.flow - other.flow).norm() < 0.05 * one.flow.norm()
+
+
 @pytest.mark.parametrize(
     ("images", "options", "word"),
     [
         (torch.zeros(1, 32, 32, 3), {}, "2 frames"),
         (torch.zeros(3, 8, 32, 3), {}, "16 pixels"),
         (torch.zeros(3, 32, 32, 3), {"preset": "best"}, "preset"),
+        (torch.zeros(3, 32, 32, 3), {"method": "best"}, "method"),
     ],
 )
 def test_flow_refuses(images, options, word):
