@@ -101,12 +101,12 @@ def assemble(shots: Sequence[Shot], *, size: tuple[int, int] | None = None, fold
             raise UserError(
                 f"view {shot.view} has images of two sizes: {camera.image.name} {camera.size} and {shot.image.name} {shot.size} px"
             )
-        if not torch.allclose(camera.K, shot.K) or camera.distortion != shot.distortion:
+        if not _same(camera.K, shot.K, rtol=1e-5, atol=1e-8) or camera.distortion != shot.distortion:
             raise UserError(
                 f"the lens of view {shot.view} changes between {camera.image.name} and {shot.image.name}: film without zoom and give all "
                 "frames of a view one focal length, centre and distortion, or make them separate views"
             )
-        moves = moves or not torch.allclose(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE)
+        moves = moves or not _same(camera.viewmat, shot.viewmat, rtol=0, atol=SAME_POSE)
     width, height = size or first[views[0]].size or image_size(shots[0].image)
     cameras = Cameras(
         _poses(grid, views, len(times)) if moves else torch.stack([first[view].viewmat for view in views]).float(),
@@ -226,6 +226,11 @@ def read_intrinsics(value: Any, where: str) -> Tensor:
     if K[0, 1] != 0 or not torch.equal(K[2], K.new_tensor([0.0, 0.0, 1.0])) or K[1, 0] != 0:
         raise UserError(f"{where} must have the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     return K
+
+
+def _same(one: Tensor, other: Tensor, **tolerances: float) -> bool:
+    """Return whether two matrices are equal within tolerances; those of a fixed camera are the same, which is seen at once."""
+    return one is other or torch.equal(one, other) or torch.allclose(one, other, **tolerances)
 
 
 def natural_key(text: str) -> list[tuple[int, str]]:

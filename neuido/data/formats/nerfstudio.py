@@ -50,6 +50,7 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
     shots: list[Shot] = []
     held_out: set[str] = set()
     poses: dict[tuple, str] = {}
+    matrices: dict[str, Tensor] = {}
     seen: set[Path] = set()
     for file in files:
         content = read_json(file)
@@ -58,7 +59,7 @@ def read(path: Path, *, recording: str | None = None, frame_interval: float | No
         kept = {name for key in ("val_filenames", "test_filenames") for name in _names(content, key, file)}
         for i, entry in enumerate(list_of_mappings(require_key(content, "frames", str(file)), f"{file}: frames")):
             where = f"{file.name}: frames[{i}]"
-            shot = _shot(entry, content, folder, where, poses)
+            shot = _shot(entry, content, folder, where, poses, matrices)
             if file.name in SPLITS[1:] or str(entry["file_path"]) in kept:
                 held_out.add(shot.view)
             if shot.image not in seen:  # all three files of GIC list the test views
@@ -153,11 +154,20 @@ def _names(content: dict[str, Any], key: str, file: Path) -> list[str]:
     return [str(name) for name in given]
 
 
-def _shot(own: dict[str, Any], shared: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str]) -> Shot:
-    """Read one entry of `frames`; keys that it lacks are taken from the top level of the file."""
+def _shot(
+    own: dict[str, Any], shared: dict[str, Any], folder: Path, where: str, poses: dict[tuple, str], matrices: dict[str, Tensor]
+) -> Shot:
+    """Read one entry of `frames`; keys that it lacks are taken from the top level of the file.
+
+    `poses` holds the names of unnamed views by their pose, `matrices` the poses of the file that were converted before: a fixed camera
+    has one for all its frames.
+    """
     entry = shared | own
     image = _image(folder, require_key(entry, "file_path", where), where)
-    viewmat = viewmat_from_opengl(require_key(entry, "transform_matrix", where), f"{where}.transform_matrix")
+    written = require_key(entry, "transform_matrix", where)
+    viewmat = matrices.get(repr(written))
+    if viewmat is None:
+        viewmat = matrices[repr(written)] = viewmat_from_opengl(written, f"{where}.transform_matrix")
     model = entry.get("camera_model", "OPENCV")
     if model not in PINHOLES:
         raise UserError(f"{where}.camera_model = {model!r} must be one of {', '.join(PINHOLES)}: undistort the images first")

@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from neuido.models.inference.pipeline import carry_points, render_motion
 from neuido.models.inference.prepared_scene import PreparedScene
+from neuido.models.render.similarity import structural_similarity
 from neuido.models.scoring.flip import flip
 from neuido.models.scoring.lpips import LPIPS, Absent
 from neuido.models.scoring.metrics import chamfer_distance, resampling_floor
@@ -94,9 +94,7 @@ def _image_rows(images: Tensor, recorded: Tensor, lpips: LPIPS | Absent) -> list
     columns = {"psnr": psnr}
     a, b = images.permute(0, 3, 1, 2).contiguous(), recorded.permute(0, 3, 1, 2).contiguous()
     if min(a.shape[-2:]) >= 11:  # window size of SSIM
-        with torch.backends.cudnn.flags(enabled=torch.backends.cudnn.enabled, allow_tf32=False):  # TF32 would lose the variances
-            ssim = [structural_similarity_index_measure(x, y, data_range=1.0, reduction="none") for x, y in zip(a.split(16), b.split(16))]
-        columns["ssim"] = torch.cat([part.reshape(-1) for part in ssim])
+        columns["ssim"] = torch.cat([structural_similarity(x, y) for x, y in zip(a.split(16), b.split(16))])
     columns["flip"] = torch.cat([flip(x, y) for x, y in zip(a.split(16), b.split(16))])
     if isinstance(lpips, LPIPS) and min(a.shape[-2:]) >= 32:
         columns["lpips"] = torch.cat([lpips(x, y) for x, y in zip(a.split(8), b.split(8))])
