@@ -11,6 +11,11 @@ from neuido.data.files.values import with_prefix
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
 from neuido.physics.laws.neural.networks import hencky_strain
 
+SECANT = 3e-3
+"""Strain of the secants that give small-strain moduli."""
+SAMPLES = 48
+"""Number of deformation gradients of the penalty, a third each at small, medium and large strains."""
+
 
 class Moduli(NamedTuple):
     """Elastic constants at small strains."""
@@ -24,7 +29,7 @@ class Moduli(NamedTuple):
         return f"E = {with_prefix(self.young, 'Pa')}, nu = {self.poisson:.3f} (small strain)"
 
 
-def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> tuple[Tensor, Tensor]:
+def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = SECANT) -> tuple[Tensor, Tensor]:
     """Return Young's modulus [Pa] (S,) and Poisson's ratio [-] (S,) of the elastic laws of z (S, d).
 
     The Lame parameters are secants over F = I +- strain e_a e_a^T, averaged over the three axes a. For an anisotropic law (the trunk `raw`)
@@ -40,22 +45,38 @@ def small_strain_moduli(operator: IntrinsicDynamicsOperator, z: Tensor, strain: 
     return mu * (3 * lam + 2 * mu) / (lam + mu), lam / (2 * (lam + mu))
 
 
-def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = 3e-3) -> Tensor:
+def p_wave_modulus(operator: IntrinsicDynamicsOperator, z: Tensor, strain: float = SECANT) -> Tensor:
     """Return the P-wave modulus [Pa] (S,) of the laws of z (S, d), as a secant over F_11 = 1 +- strain; differentiable."""
-    F = torch.eye(3, dtype=z.dtype, device=z.device).expand(len(z), 2, 3, 3).clone()
-    F[:, 0, 0, 0] += strain
-    F[:, 1, 0, 0] -= strain
-    tau = operator.elastic(z, F)[..., 0, 0]
-    return (tau[:, 0] - tau[:, 1]) / (2 * strain)
+    F = _pulls(strain, z.dtype, z.device)
+    return _secant(operator.elastic(z, F.expand(len(z), 2, 3, 3).contiguous()), strain)
+
+
+@functools.lru_cache(maxsize=8)
+def _pulls(strain: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Return the deformation gradients F_11 = 1 +- strain, (2, 3, 3): constants, as `_probes`."""
+    with torch.inference_mode(False), torch.no_grad():
+        F = torch.eye(3, dtype=dtype).expand(2, 3, 3).clone()
+        F[0, 0, 0] += strain
+        F[1, 0, 0] -= strain
+    return F.to(device)
+
+
+def _secant(tau: Tensor, strain: float) -> Tensor:
+    """Return the modulus (...) of the stresses (..., 2, 3, 3) at `_pulls`."""
+    return (tau[..., 0, 0, 0] - tau[..., 1, 0, 0]) / (2 * strain)
 
 
 def implausibility(operator: IntrinsicDynamicsOperator, z: Tensor) -> Tensor:
-    """Return `implausible_stress` of the elastic law of z (d,); it vanishes for laws like those of Stage I."""
-    modulus = p_wave_modulus(operator, z[None])[0]
-    return implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], modulus)
+    """Return `implausible_stress` of the elastic law of z (d,); it vanishes for laws like those of Stage I.
+
+    The law is evaluated once, for the modulus and for the penalty: on a GPU the time of such a call is that of its launches.
+    """
+    pulls, (F, strain) = _pulls(SECANT, z.dtype, z.device), _probes(SAMPLES, z.dtype, z.device)
+    tau = operator.elastic(z[None], torch.cat([pulls, F])[None])[0]
+    return _penalty(tau[2:], strain, _secant(tau[:2], SECANT))
 
 
-def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samples: int = 48) -> Tensor:
+def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor) -> Tensor:
     """Return a penalty on elastic laws that a rollout would not survive, evaluated at strains up to 0.4.
 
     A body becomes unstable in a later contact if the stress opposes the strain, or if it exceeds three times the product of small-strain
@@ -64,10 +85,13 @@ def implausible_stress(stress: Callable[[Tensor], Tensor], modulus: Tensor, samp
     Args:
         stress: Function from F (n, 3, 3) to tau (n, 3, 3) [Pa], differentiable in the parameters of the law.
         modulus: P-wave modulus [Pa], ().
-        samples: Number of deformation gradients, a third each at small, medium and large strains.
     """
-    F, strain = _probes(samples, modulus.dtype, modulus.device)
-    tau = stress(F)
+    F, strain = _probes(SAMPLES, modulus.dtype, modulus.device)
+    return _penalty(stress(F), strain, modulus)
+
+
+def _penalty(tau: Tensor, strain: Tensor, modulus: Tensor) -> Tensor:
+    """Return the penalty on the stresses tau (n, 3, 3) at strains (n, 3, 3)."""
     work = (tau * strain).sum((1, 2)) / (tau.flatten(1).norm(dim=1) * strain.flatten(1).norm(dim=1) + 1e-6)
     stiff = tau.flatten(1).norm(dim=1) / (3 * modulus.clamp(min=1e3) * strain.flatten(1).norm(dim=1))
     return (0.1 - work).relu().mean() + stiff.clamp(min=1).log().square().mean()

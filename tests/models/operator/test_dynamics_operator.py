@@ -11,6 +11,7 @@ from neuido.errors import UserError
 from neuido.models.inference.law_file import load_law, save_law
 from neuido.models.operator import dynamics_operator as module
 from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator, affine
+from neuido.models.operator.law_properties import implausibility, implausible_stress, p_wave_modulus
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.neural import networks
 from neuido.physics.laws.neural.bounded import bounded_stress, full_return_map
@@ -179,3 +180,12 @@ def test_errors_name_the_option(tmp_path, monkeypatch):
         IntrinsicDynamicsOperator.load(tmp_path / "text")
     with pytest.raises(UserError, match="no latent is named 'tofu'"):
         IntrinsicDynamicsOperator(**SMALL).latent("tofu")
+
+
+def test_implausibility_in_one_evaluation_is_that_in_two():
+    operator = make("raw")  # an untrained law, which no rollout would survive
+    z = torch.randn(6, generator=torch.Generator().manual_seed(2), dtype=torch.float64).requires_grad_()
+    found = implausibility(operator, z)
+    apart = implausible_stress(lambda F: operator.elastic(z[None], F[None])[0], p_wave_modulus(operator, z[None])[0])
+    assert float(found.detach()) > 0 and float(found.detach()) == pytest.approx(float(apart.detach()))
+    torch.testing.assert_close(*(torch.autograd.grad(value, z)[0] for value in (found, apart)))
