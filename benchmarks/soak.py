@@ -1,6 +1,6 @@
 """Soak: random short scenes over all laws, effects, bodies, contacts and solvers, each checked against what physics forbids.
 
-    python benchmarks/soak.py --out soak.csv [--scenes 10000] [--seed 0] [--device cpu] [--minutes 0] [--report soak.md]
+    python benchmarks/soak.py --out soak.csv [--scenes 10000] [--seed 0] [--device cpu] [--minutes 0] [--workers 1] [--report soak.md]
 
 A scene depends on the seed and its number alone, and a run goes on behind the rows that the file holds. A scene may be refused in one line;
 else it must be finite, keep its momentum where nothing pushes, create no energy, agree with itself in float64, and tell of matter that
@@ -9,10 +9,12 @@ turned inside out. `verdict` says what was broken; `--only N` runs one scene aga
 
 import argparse
 import csv
+import functools
 import math
+import multiprocessing
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -352,6 +354,11 @@ def run(seed: int, number: int, device: str) -> dict[str, Any]:
     return row | {"seconds": time.perf_counter() - start}
 
 
+def _run(seed: int, device: str, number: int) -> dict[str, Any]:
+    """Run a scene in a process of a pool."""
+    return run(seed, number, device)
+
+
 def report(rows: list[dict[str, str]], path: Path) -> None:
     """Write the table of a run."""
 
@@ -389,6 +396,15 @@ def report(rows: list[dict[str, str]], path: Path) -> None:
     path.write_text("\n".join(out))
 
 
+def rows_of(numbers: Sequence[int], one: Callable[[int], dict[str, Any]], workers: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of scenes as they are done, by several processes; closing it ends them."""
+    if workers == 1:
+        yield from map(one, numbers)
+        return
+    with multiprocessing.get_context("spawn").Pool(workers, torch.set_num_threads, (1,)) as pool:
+        yield from pool.imap_unordered(one, numbers)
+
+
 def main() -> None:
     """Run the scenes that are not in the file yet."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -398,6 +414,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--minutes", type=float, default=0.0)
+    parser.add_argument("--workers", type=int, default=1, help="processes that run scenes side by side")
     parser.add_argument("--only", type=int)
     given = parser.parse_args()
     if given.only is not None:
@@ -412,20 +429,20 @@ def main() -> None:
         writer = csv.DictWriter(file, COLUMNS)
         if not file.tell():
             writer.writeheader()
-        for number in range(given.scenes):
-            if number in done:
-                continue
-            if time.monotonic() > end:
-                break
-            row = run(given.seed, number, given.device)
+        left = [number for number in range(given.scenes) if number not in done]
+        rows = rows_of(left, functools.partial(_run, given.seed, given.device), given.workers)
+        for row in rows:
             writer.writerow({key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()})
             file.flush()
+            if time.monotonic() > end:
+                break
+        rows.close()
     with given.out.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    broken = [row for row in rows if row["verdict"] != "ok"]
-    print(f"{len(rows)} scenes, {len(broken)} broken")
+        found = sorted(csv.DictReader(file), key=lambda row: int(row["scene"]))
+    broken = [row for row in found if row["verdict"] != "ok"]
+    print(f"{len(found)} scenes, {len(broken)} broken")
     if given.report:
-        report(rows, given.report)
+        report(found, given.report)
 
 
 if __name__ == "__main__":
