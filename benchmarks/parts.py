@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -22,6 +23,11 @@ class Row:
     parts: dict[str, list[float]] = field(default_factory=dict)
     table: str = ""
     """Further table, as text."""
+
+    def figures(self) -> dict[str, Any]:
+        """Return what a JSON file keeps: the numbers, with the median and the number of calls of each part."""
+        parts = {name: {"median": statistics.median(t), "calls": len(t)} for name, t in self.parts.items() if t}
+        return {"name": self.name, "seconds": self.seconds, "count": self.count, "note": self.note, "parts": parts}
 
 
 @contextlib.contextmanager

@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import functools
 import io
+import json
 import os
 import platform
 import statistics
@@ -101,6 +102,9 @@ class Bench:
         from neuido.data.scenes.synthetic import make_scenes
         from neuido.models.render.gaussians import attach_gaussians, save_gaussians
 
+        made = sorted((self.folder / "scenes").glob("Ball*"))
+        if len(made) >= self.options.scenes:
+            return made[: self.options.scenes]
         entries = []
         for i in range(self.options.scenes):
             entries.append({
@@ -226,8 +230,7 @@ def pictures(bench: Bench) -> list[Row]:
             times = bench.times(functools.partial(draw, gradient), bench.options.repeat)
             rows.append(Row(f"{name}, {way}", statistics.median(times), len(times)))
         if bench.device.type == "cuda":
-            longest = max(room for size, room in splatting._rooms.items() if size[2] == gaussians)
-            run = functools.partial(draw, True, capacity=longest)
+            run = functools.partial(draw, True, capacity=splatting.room_of(1, gaussians))
             run()
             graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(graph):
@@ -254,38 +257,63 @@ def picture(tensors: list[torch.Tensor], pixels: int) -> Callable[..., None]:
 
 
 def law(bench: Bench) -> list[Row]:
-    """Time the way from the frames of two views in memory to a law, alone and with others."""
+    """Time the way from two views of a scene to a law: decoding, then from memory by each method of flow, then several scenes together."""
     from neuido.data.scenes.filmed_scene import load_visual_scene
     from neuido.models.operator.dynamics_operator import IntrinsicDynamicsOperator
+    from neuido.models.operator.law_properties import p_wave_modulus
     from neuido.models.video import encoder as encoder_module
     from neuido.models.video import flow
 
-    scene = load_visual_scene(bench.scenes[0])
+    open_two = functools.partial(load_visual_scene, views=("0", "1"))
+    repeat = max(2, bench.options.repeat // 4)
+    times = bench.times(functools.partial(open_two, bench.scenes[0]), 2)
+    rows = [Row("decode 80 frames x 2 views", statistics.median(times), len(times), f"{os.cpu_count()} cores")]
+    scenes = [open_two(folder) for folder in bench.scenes]
     operator = IntrinsicDynamicsOperator.load("pretrained").to(bench.device).eval()
     encoder = encoder_module.DynamicsEncoder.load("pretrained").to(bench.device).eval()
 
     @torch.no_grad()
-    def read() -> None:
-        seen = encoder.measure_flow(scene.batch, [0, 1], scene.body.x.mean(0))
-        for one in operator.laws(encoder(*(t.to(bench.device) for t in encoder.embed(seen)))):
-            one.tensors()
+    def read(count: int, method: str) -> torch.Tensor:
+        seen = [encoder.measure_flow(scene.batch, [0, 1], scene.body.x.mean(0), method=method) for scene in scenes[:count]]
+        interval, cell = (torch.cat(parts) for parts in zip(*((torch.full((2,), one.frame_interval), one.cell) for one in seen)))
+        volume, conditions = encoder.embed_flow(torch.cat([one.flow for one in seen]), interval, cell, batch=2 * count)
+        z = torch.stack([encoder(*pair) for pair in zip(volume.split(2), conditions.split(2))])
+        for one in z:
+            for part in operator.laws(one):
+                part.tensors()
+        return z
 
-    repeat = max(2, bench.options.repeat // 4)
-    times = bench.times(read, repeat)
-    wanted = {"flow of all pairs": (flow, "optical_flow"), "crop": (flow, "_crop_flow"), "VAE": (encoder_module.DynamicsEncoder, "embed"),
-              "projector": (encoder_module.DynamicsEncoder, "forward")}  # fmt: skip
-    with parts(wanted, bench.wait) as found:
-        read()
-    return [Row("law from 80 frames x 2 views in memory", statistics.median(times), repeat, "alone", found)]
+    wanted = {"flow of all pairs": (flow, "optical_flow"), "brightness": (flow, "_brightness"), "parallel flow": (flow, "parallel_flow"),
+              "crop": (flow, "_crop_flow"), "VAE": (encoder_module.DynamicsEncoder, "embed_flow"),
+              "projector": (encoder_module.DynamicsEncoder, "forward"),
+              "law": (IntrinsicDynamicsOperator, "laws")}  # fmt: skip
+    moduli = {}
+    for method in flow.METHODS:
+        times = bench.times(functools.partial(read, 1, method), repeat)
+        with parts(wanted, bench.wait) as found:
+            read(1, method)
+        moduli[method] = p_wave_modulus(operator, read(len(scenes), method))
+        rows.append(Row(f"law from 80 frames x 2 views in memory, {method}", statistics.median(times), repeat, "alone", found))
+        if len(scenes) > 1:
+            together = statistics.median(bench.times(functools.partial(read, len(scenes), method), repeat))
+            further = (together - rows[-1].seconds) / (len(scenes) - 1)
+            rows.append(Row(f"law of a further scene, {method}", further, repeat, f"{len(scenes)} scenes {together:.3f} s"))
+    ratios = (moduli["parallel"] / moduli["opencv"]).log().abs().exp()
+    rows[
+        -1
+    ].note += f"; moduli read by both methods differ by {float(ratios.max()) - 1:.2%} at most, {float(ratios.median()) - 1:.2%} median"
+    return rows
 
 
 def few_shot(bench: Bench) -> list[Row]:
     """Time the steps of an adaptation, then measure the parts of a step."""
+    from lightning.pytorch import LightningModule
     from lightning.pytorch.strategies import Strategy
 
+    from neuido.models.fewshot.fit_progress import Progress
     from neuido.models.fewshot.scene_fit import SceneFit
-    from neuido.models.inference import pipeline
-    from neuido.models.stages import adapt, image_module
+    from neuido.models.inference import pipeline, prepared_scene
+    from neuido.models.stages import adapt, image_module, scene_ranks
 
     given = ["fit", "--config", str(ROOT / "configs" / "adapt.yaml"), *bench.training("fit"), "--data.scenes", f"[{bench.scenes[0].name}]"]
     given += ["--trainer.callbacks", "null"]
@@ -311,7 +339,10 @@ def few_shot(bench: Bench) -> list[Row]:
         parts_of = {
             "step": (adapt.AdaptModule, "training_step"), "rollout": (SceneFit, "rollout"), "images and losses": (adapt, "image_losses"),
             "render with deformation": (image_module, "render_motion"), "deformation": (pipeline, "deform"),
-            "regulariser": (SceneFit, "regulariser"), "backward": (Strategy, "backward"),
+            "regulariser": (SceneFit, "regulariser"), "backward": (Strategy, "backward"), "bind": (prepared_scene, "bind"),
+            "copy of the parameters": (Progress, "record_success"), "clip": (LightningModule, "configure_gradient_clipping"),
+            "check of the gradient": (adapt.AdaptModule, "on_before_optimizer_step"), "log": (scene_ranks.SharesScenes, "_log"),
+            "all but the waiting": (LightningModule, "optimizer_step"),
         }  # fmt: skip
         with parts(parts_of, bench.wait) as found:
             bench.neuido(*given, "--model.steps", str(few), "--model.curriculum", "[]", "--model.out", str(bench.folder / "fit2"))
@@ -337,13 +368,15 @@ def test(bench: Bench) -> list[Row]:
         "floor": (motion_scores, "floor_per_frame"),
         "score images": (motion_scores, "score_images"), "render": (motion_scores, "render_motion"), "write": (align, "write_frame_scores"),
     }  # fmt: skip
-    given = ["test", "--config", str(ROOT / "configs" / "stage2.yaml"), *bench.training("test")]
-    start = time.perf_counter()
-    bench.neuido(*given)
-    seconds = time.perf_counter() - start
+    given = ["test", "--config", str(ROOT / "configs" / "stage2.yaml"), *bench.training("test"), "--model.flow_method", bench.options.flow]
+    process = f"from neuido.commands.main import main; main({given!r})"
+    seconds = [in_a_process(process)[0] for _ in range(2)]
     with parts(wanted, bench.wait) as found:
+        start = time.perf_counter()
         bench.neuido(*given)
-    return [Row(f"test, {len(bench.scenes)} scenes", seconds, 1, "in this process; `import torch` and start come on top", found)]
+        here = time.perf_counter() - start
+    note = f"process of its own, the second; {seconds[0]:.2f} s the first, {here:.2f} s in this process; flow by {bench.options.flow}"
+    return [Row(f"test, {len(bench.scenes)} scenes", seconds[1], 1, note, found)]
 
 
 def reconstruct(bench: Bench) -> list[Row]:
@@ -410,6 +443,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, default=100, help="steps of the adaptation")
     parser.add_argument("--repeat", type=int, default=20)
     parser.add_argument("--seconds", type=float, default=600.0, help="no further row begins after this time")
+    parser.add_argument("--flow", default="opencv", choices=("opencv", "parallel"), help="method of optical flow of the row `test`")
+    parser.add_argument("--folder", type=Path, help="folder for the scenes, which are taken from there if it has them")
+    parser.add_argument("--json", type=Path, help="JSON file of the rows")
     parser.add_argument("--small", action="store_true", help="tiny scenes")
     parser.add_argument("--out", type=Path, help="markdown file")
     options = parser.parse_args(arguments)
@@ -417,7 +453,7 @@ def main(arguments: list[str] | None = None) -> None:
     if unknown:
         parser.error(f"--only {','.join(sorted(unknown))}: known are {', '.join(ROWS)}")
     with tempfile.TemporaryDirectory() as folder:
-        bench, rows = Bench(options, Path(folder)), []
+        bench, rows = Bench(options, options.folder or Path(folder)), []
         for name in options.only.split(","):
             if bench.left() <= 0:
                 rows.append(Row(name, float("nan"), 0, "left out: no time"))
@@ -429,6 +465,8 @@ def main(arguments: list[str] | None = None) -> None:
             text = report(bench, rows)
             if options.out:
                 options.out.write_text(text)
+            if options.json:
+                options.json.write_text(json.dumps([row.figures() for row in rows], indent=1))
             print(f"{name}: {time.perf_counter() - bench.begun:.0f} s since the start", file=sys.stderr, flush=True)
         print(report(bench, rows))
 

@@ -301,6 +301,11 @@ whose entries do not fit is drawn twice; one size is kept, so that memory and re
 _rooms: dict[tuple, int] = {}
 
 
+def room_of(images: int, gaussians: int) -> int | None:
+    """Return the largest room that calls of this size on CUDA have now, as a `capacity` to begin with; None before the first."""
+    return max((room for (_, *size, _), room in _rooms.items() if size == [images, gaussians]), default=None)
+
+
 def _set_room(key: tuple, total: int) -> None:
     """Choose the room of the next call of a size from the entries of this one."""
     if not total <= _rooms.get(key, -1) <= LARGEST_ROOM * total:
