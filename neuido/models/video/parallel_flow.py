@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from neuido.models.video.flow_kernels import PATCH, build
+from neuido.models.video.search_kernels import PATCH, build
 from neuido.physics.runtime.device import launch, torch_stream
 
 
