@@ -14,7 +14,7 @@ import math
 import multiprocessing
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -396,7 +396,7 @@ def report(rows: list[dict[str, str]], path: Path) -> None:
     path.write_text("\n".join(out))
 
 
-def rows_of(numbers: Sequence[int], one: Callable[[int], dict[str, Any]], workers: int) -> Iterator[dict[str, Any]]:
+def rows_of(numbers: Sequence[int], one: Callable[[int], dict[str, Any]], workers: int) -> Generator[dict[str, Any], None, None]:
     """Yield the rows of scenes as they are done, by several processes; closing it ends them."""
     if workers == 1:
         yield from map(one, numbers)

@@ -228,9 +228,9 @@ def read_intrinsics(value: Any, where: str) -> Tensor:
     return K
 
 
-def _same(one: Tensor, other: Tensor, **tolerances: float) -> bool:
+def _same(one: Tensor, other: Tensor, *, rtol: float, atol: float) -> bool:
     """Return whether two matrices are equal within tolerances; those of a fixed camera are the same, which is seen at once."""
-    return one is other or torch.equal(one, other) or torch.allclose(one, other, **tolerances)
+    return one is other or torch.equal(one, other) or torch.allclose(one, other, rtol=rtol, atol=atol)
 
 
 def natural_key(text: str) -> list[tuple[int, str]]:
