@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from neuido.models.video.search_kernels import PATCH, build
-from neuido.physics.runtime.device import launch, torch_stream
+from neuido.physics.runtime.device import launch, start_warp, torch_stream
 
 
 class Search(NamedTuple):
@@ -46,6 +46,7 @@ def parallel_flow(grey: Tensor, preset: str = "medium") -> Tensor:
     for _ in range(coarsest):
         pyramid.append(functional.avg_pool2d(pyramid[-1][:, None], 2, ceil_mode=True, count_include_pad=False)[:, 0].contiguous())
     pairs = videos * (frames - 1)
+    start_warp()  # nothing else may have used Warp before
     flow = torch.zeros(pairs, *pyramid[-1].shape[1:], 2, device=grey.device)
     with torch_stream(grey.device):
         for scale in range(coarsest, min(options.finest, coarsest) - 1, -1):

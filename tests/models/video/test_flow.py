@@ -1,5 +1,7 @@
 """Optical flow of a known motion, its image, its window and its cache."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -72,6 +74,22 @@ def test_flow_at_once_bends_as_that_of_opencv():
     )
     errors = [(optical_flow(video, method=method)[0] - true)[16:-16, 16:-16].norm(dim=-1).mean() for method in ("opencv", "parallel")]
     assert errors[1] < 1.2 * errors[0] and errors[1] < 0.1 * true[16:-16, 16:-16].norm(dim=-1).mean()
+
+
+def test_brightness_is_the_weighted_mean_in_bytes():
+    videos = torch.rand(2, 3, 20, 30, 3, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.1  # also outside of what images hold
+    with ThreadPoolExecutor(2) as pool:
+        found = module._brightness(list(videos), pool)
+    expected = (255 * (videos @ torch.tensor(module.GREY))).round().clamp(0, 255)
+    assert found.dtype == torch.uint8 and (found.float() - expected).abs().max() <= 1
+    assert (found.float() == expected).float().mean() > 0.999
+
+
+def test_windows_of_several_videos_are_those_of_each():
+    masks = torch.zeros(2, 5, 40, 40)
+    masks[0, 2, 3:9, 5:12] = 1
+    masks[1, 1, 20:30, 22:39] = 0.7
+    assert module._windows(list(masks)) == [body_window(mask) for mask in masks]
 
 
 def test_velocities_by_both_methods_agree(tmp_path):
