@@ -57,6 +57,18 @@ def test_recordings_in_one_launch_move_as_alone(setting, device, experiment):
     assert float((problem._moved(POINTS[2], 0).x - problem._moved({"young": 6e4}, 0).x).abs().max()) > 1e-3
 
 
+@pytest.mark.parametrize("setting", [0, 5], ids=lambda s: SETTINGS[s].name)
+@pytest.mark.parametrize("stage", [1, 2, 3])
+def test_kernels_of_effects_that_are_absent_do_not_move_a_body(stage, setting, experiment, monkeypatch):
+    """On a GPU a launch has all effects of its stage, whichever of them its motions have."""
+    problem, point, own = body_problem(experiment), {"young": 6e4}, BodyProblem._effects
+    always = body_launches.names(problem.candidates, stage)
+    assert {body_launches.stage({name: 1.0}) for name in always} == set(range(1, stage + 1))
+    alone = problem._moved(point, 0, setting)
+    monkeypatch.setattr(BodyProblem, "_effects", lambda self, simulator, full, of, _: own(self, simulator, full, of, always))
+    torch.testing.assert_close(body_problem(experiment)._moved(point, 0, setting).x, alone.x, atol=2e-5, rtol=0.0)
+
+
 def test_fibres_and_gradients_turn_with_the_body(experiment):
     problem = body_problem(experiment)
     full = [POINTS[2], {**POINTS[2], "stiffness_gradient.x": 2.0}]
