@@ -163,10 +163,12 @@ class BodyRollouts(Problem):
         elasticity, plasticity = self.laws(full)
         always = () if self.device == "cpu" or len(full) == 1 else body_launches.names(self.candidates, max(map(body_launches.stage, full)))
         effects = self._effects(simulator, full, [n for _, n in runs], always)
-        share = EVERY[setting].share
-        every, steps, exact = substeps(self.measured[runs[0][1]], simulator.scenes[0].dt, share)
+        share, first = EVERY[setting].share, self.measured[runs[0][1]]
+        every, steps, exact = substeps(first, simulator.scenes[0].dt, share)
+        segment = segment_of(steps if self.device == "cpu" else substeps(first, simulator.scenes[0].dt)[1], every)
+        steps = segment * math.ceil(steps / segment)  # on a GPU, what is captured for whole motions serves early ones too
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
-        given |= {"every": every, "segment": segment_of(steps, every)}
+        given |= {"every": every, "segment": segment}
         elements = EVERY[setting].solver == "finite_elements"
         if elements and len(inner := {self.inner_steps(point, setting) for points, _ in runs for point in points}) == 1 and any(inner):
             given["inner"] = inner.pop()
