@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from neuido.physics.mpm.kernels.reductions import ADD4, ARRANGE, GATHER, RUN, SPREAD
+from neuido.physics.mpm.kernels.reductions import ARRANGE, GATHER, GATHER_ADJOINT, RUN, SPREAD, SPREAD_ADJOINT
 
 
 def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
@@ -23,6 +23,7 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
     vec4 = wp.types.vector(length=4, dtype=real)
     mat33 = wp.types.matrix(shape=(3, 3), dtype=real)
     mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
+    mat54 = wp.types.matrix(shape=(5, 4), dtype=real)
     func = functools.partial(wp.func, module=module)
 
     @func
@@ -42,17 +43,26 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         @wp.func_native(RUN)
         def run_of(node: int) -> int: ...
 
-        @wp.func_native(ADD4)
-        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int): ...
-
         @wp.func_native(SPREAD)
         def spread(
             grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
             b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real, run: int,
         ): ...  # fmt: skip
 
+        @wp.func_native(SPREAD_ADJOINT)
+        def spread_adjoint(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3, gx: vec3, gy: vec3, gz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real,
+        ) -> mat54: ...  # fmt: skip
+
         @wp.func_native(GATHER)
         def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3) -> mat43: ...
+
+        @wp.func_native(GATHER_ADJOINT)
+        def moments_adjoint(
+            grid: wp.array(dtype=vec4), velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            gx: vec3, gy: vec3, gz: vec3, b: vec3, ax: vec3, ay: vec3, az: vec3, run: int,
+        ) -> vec3: ...  # fmt: skip
 
     else:
 
@@ -63,10 +73,6 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         @func
         def run_of(node: int):
             return 0
-
-        @func
-        def add4(grid: wp.array(dtype=vec4), node: int, value: vec4, run: int):
-            wp.atomic_add(grid, node, value)
 
         @func
         def spread(
@@ -86,6 +92,92 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
                         bk = bk + az
                     bj = bj + ay
                 bi = bi + ax
+
+        @func
+        def spread_adjoint(
+            grid: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3, gx: vec3, gy: vec3, gz: vec3,
+            b: vec3, ax: vec3, ay: vec3, az: vec3, mass: real,
+        ):  # fmt: skip
+            ix = first_moment(wx)
+            iy = first_moment(wy)
+            iz = first_moment(wz)
+            none = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
+            s0 = none
+            sx = none
+            sy = none
+            sz = none
+            slope = vec3(real(0.0), real(0.0), real(0.0))
+            bi = b
+            for i in range(3):
+                bj = bi
+                ti = none
+                tiy = none
+                tiz = none
+                pi = real(0.0)
+                piy = real(0.0)
+                piz = real(0.0)
+                for j in range(3):
+                    bk = bj
+                    tj = none
+                    tjz = none
+                    pj = real(0.0)
+                    pjz = real(0.0)
+                    row = node + (i * ny + j) * nz
+                    for k in range(3):
+                        g = grid[row + k]
+                        phi = wp.dot(velocity_of(g), bk) + mass * g[3]
+                        tj += wz[k] * g
+                        tjz += iz[k] * g
+                        pj += wz[k] * phi
+                        pjz += gz[k] * phi
+                        bk = bk + az
+                    ti += wy[j] * tj
+                    tiy += iy[j] * tj
+                    tiz += wy[j] * tjz
+                    pi += wy[j] * pj
+                    piy += gy[j] * pj
+                    piz += wy[j] * pjz
+                    bj = bj + ay
+                s0 += wx[i] * ti
+                sx += ix[i] * ti
+                sy += wx[i] * tiy
+                sz += wx[i] * tiz
+                slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+                bi = bi + ax
+            return wp.matrix_from_rows(s0, sx, sy, sz, vec4(slope[0], slope[1], slope[2], real(0.0)))
+
+        @func
+        def moments_adjoint(
+            grid: wp.array(dtype=vec4), velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3,
+            gx: vec3, gy: vec3, gz: vec3, b: vec3, ax: vec3, ay: vec3, az: vec3, run: int,
+        ):  # fmt: skip
+            slope = vec3(real(0.0), real(0.0), real(0.0))
+            qi = b
+            for i in range(3):
+                qj = qi
+                pi = real(0.0)
+                piy = real(0.0)
+                piz = real(0.0)
+                for j in range(3):
+                    qk = qj
+                    pj = real(0.0)
+                    pjz = real(0.0)
+                    wij = wx[i] * wy[j]
+                    row = node + (i * ny + j) * nz
+                    for k in range(3):
+                        w = wij * wz[k]
+                        phi = wp.dot(qk, velocity_of(velocity[row + k]))
+                        pj += wz[k] * phi
+                        pjz += gz[k] * phi
+                        wp.atomic_add(grid, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)))
+                        qk = qk + az
+                    pi += wy[j] * pj
+                    piy += gy[j] * pj
+                    piz += wy[j] * pjz
+                    qj = qj + ay
+                slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
+                qi = qi + ax
+            return slope
 
         @func
         def moments(velocity: wp.array(dtype=vec4), node: int, ny: int, nz: int, wx: vec3, wy: vec3, wz: vec3):
@@ -164,14 +256,15 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
     @func
     def in_grid(y: vec3, origin: vec3, h: real, nodes: wp.vec3i):
         """Return whether the stencil of a particle at y lies in the padded grid."""
-        c = (y - origin) / h
+        c = y - origin
+        least = real(0.5) * h
         return (
-            c[0] >= real(0.5)
-            and c[1] >= real(0.5)
-            and c[2] >= real(0.5)
-            and c[0] <= real(nodes[0]) - real(1.5)
-            and c[1] <= real(nodes[1]) - real(1.5)
-            and c[2] <= real(nodes[2]) - real(1.5)
+            c[0] >= least
+            and c[1] >= least
+            and c[2] >= least
+            and c[0] <= (real(nodes[0]) - real(1.5)) * h
+            and c[1] <= (real(nodes[1]) - real(1.5)) * h
+            and c[2] <= (real(nodes[2]) - real(1.5)) * h
         )
 
     return SimpleNamespace(
@@ -179,9 +272,10 @@ def functions(real: type, module: str, *, native: bool) -> SimpleNamespace:
         first_moment=first_moment,
         arrange=arrange,
         run_of=run_of,
-        add4=add4,
         spread=spread,
+        spread_adjoint=spread_adjoint,
         moments=moments,
+        moments_adjoint=moments_adjoint,
         spline=spline,
         spline_slope=spline_slope,
         first_node=first_node,

@@ -52,8 +52,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
 
     own = stencil_functions.functions(real, name, native=real is wp.float32 and not enable_backward)
-    velocity_of, first_moment, arrange, run_of = own.velocity_of, own.first_moment, own.arrange, own.run_of
-    add4, spread, moments, spline = own.add4, own.spread, own.moments, own.spline
+    arrange, run_of, spline = own.arrange, own.run_of, own.spline
+    spread, spread_adjoint, moments, moments_adjoint = own.spread, own.spread_adjoint, own.moments, own.moments_adjoint
     spline_slope, first_node, flat_index, stencil = own.spline_slope, own.first_node, own.flat_index, own.stencil
     stencil_offset, column, extend_span, in_grid = own.stencil_offset, own.column, own.extend_span, own.in_grid
 
@@ -123,74 +123,26 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         wx = spline(f[0])
         wy = spline(f[1])
         wz = spline(f[2])
-        ix = first_moment(wx)
-        iy = first_moment(wy)
-        iz = first_moment(wz)
         gx = spline_slope(f[0])
         gy = spline_slope(f[1])
         gz = spline_slope(f[2])
         ratio = dt[s] * volume[p] * real(4.0) / (h * h)
         hA = h * (m * C[p] - ratio * tau[p])
-        ax = column(hA, 0)
-        ay = column(hA, 1)
-        az = column(hA, 2)
-        bi = m * v[p] - hA * f
+        first = m * v[p] - hA * f
         node = flat_index(s, base, nodes)
-        zero = vec3(real(0.0), real(0.0), real(0.0))
-        s0 = zero
-        sx = zero
-        sy = zero
-        sz = zero
-        slope = zero
-        sm = real(0.0)
-        for i in range(3):
-            bj = bi
-            ti = zero
-            tiy = zero
-            tiz = zero
-            pi = real(0.0)
-            piy = real(0.0)
-            piz = real(0.0)
-            mi = real(0.0)
-            for j in range(3):
-                bk = bj
-                tj = zero
-                tjz = zero
-                pj = real(0.0)
-                pjz = real(0.0)
-                mj = real(0.0)
-                row = node + (i * nodes[1] + j) * nodes[2]
-                for k in range(3):
-                    g = a_grid[row + k]
-                    a = velocity_of(g)
-                    phi = wp.dot(a, bk) + m * g[3]
-                    tj += wz[k] * a
-                    tjz += iz[k] * a
-                    pj += wz[k] * phi
-                    pjz += gz[k] * phi
-                    mj += wz[k] * g[3]
-                    bk = bk + az
-                ti += wy[j] * tj
-                tiy += iy[j] * tj
-                tiz += wy[j] * tjz
-                pi += wy[j] * pj
-                piy += gy[j] * pj
-                piz += wy[j] * pjz
-                mi += wy[j] * mj
-                bj = bj + ay
-            s0 += wx[i] * ti
-            sx += ix[i] * ti
-            sy += wx[i] * tiy
-            sz += wx[i] * tiz
-            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
-            sm += wx[i] * mi
-            bi = bi + ax
+        sums = spread_adjoint(a_grid, node, nodes[1], nodes[2], wx, wy, wz, gx, gy, gz,
+                              first, column(hA, 0), column(hA, 1), column(hA, 2), m)  # fmt: skip
+        s0 = vec3(sums[0, 0], sums[0, 1], sums[0, 2])
+        sx = vec3(sums[1, 0], sums[1, 1], sums[1, 2])
+        sy = vec3(sums[2, 0], sums[2, 1], sums[2, 2])
+        sz = vec3(sums[3, 0], sums[3, 1], sums[3, 2])
+        slope = vec3(sums[4, 0], sums[4, 1], sums[4, 2])
         s1 = h * wp.matrix_from_cols(sx - f[0] * s0, sy - f[1] * s0, sz - f[2] * s0)
         a_v[p] = m * s0
         a_C[p] = m * s1
         a_tau[p] = -ratio * s1
         a_x[p] = a_x[p] + (slope - wp.transpose(hA) * s0) / h
-        a_mass[p] = a_mass[p] + wp.dot(s0, v[p]) + wp.ddot(s1, C[p]) + sm
+        a_mass[p] = a_mass[p] + wp.dot(s0, v[p]) + wp.ddot(s1, C[p]) + sums[0, 3]
 
     @kernel
     def grid_to_particles(
@@ -264,7 +216,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             if since[p] < 0:
                 since[p] = step
         code = int(0)
-        if not (wp.length(v) * dt[s] < h):
+        if not (dt[s] * dt[s] * wp.dot(v, v) < h * h):
             code = wp.static(FAST)
         if not in_grid(y, origin[s], h, nodes):
             code = wp.max(code, wp.static(LOST))
@@ -314,37 +266,10 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         aF = a_F_trial[p]
         a_F[p] = aF + (free * dt[s]) * (wp.transpose(C_next[p]) * aF)
         hB = (free * real(4.0) / h) * (a_C_next[p] + dt[s] * (aF * wp.transpose(F[p])))
-        bx = column(hB, 0)
-        by = column(hB, 1)
-        bz = column(hB, 2)
-        qi = free * (a_v_next[p] + dt[s] * a_x_next[p]) - hB * f
+        first = free * (a_v_next[p] + dt[s] * a_x_next[p]) - hB * f
         node = flat_index(s, base, nodes)
-        run = run_of(node)
-        slope = vec3(real(0.0), real(0.0), real(0.0))
-        for i in range(3):
-            qj = qi
-            pi = real(0.0)
-            piy = real(0.0)
-            piz = real(0.0)
-            for j in range(3):
-                qk = qj
-                pj = real(0.0)
-                pjz = real(0.0)
-                wij = wx[i] * wy[j]
-                row = node + (i * nodes[1] + j) * nodes[2]
-                for k in range(3):
-                    w = wij * wz[k]
-                    phi = wp.dot(qk, velocity_of(velocity[row + k]))
-                    pj += wz[k] * phi
-                    pjz += gz[k] * phi
-                    add4(a_velocity, row + k, vec4(w * qk[0], w * qk[1], w * qk[2], real(0.0)), run)
-                    qk = qk + bz
-                pi += wy[j] * pj
-                piy += gy[j] * pj
-                piz += wy[j] * pjz
-                qj = qj + by
-            slope += vec3(gx[i] * pi, wx[i] * piy, wx[i] * piz)
-            qi = qi + bx
+        slope = moments_adjoint(a_velocity, velocity, node, nodes[1], nodes[2], wx, wy, wz, gx, gy, gz,
+                                first, column(hB, 0), column(hB, 1), column(hB, 2), run_of(node))  # fmt: skip
         a_x[p] = a_x_next[p] + (slope - wp.transpose(hB) * v_next[p]) / h
 
     @adjoint_kernel
