@@ -424,6 +424,7 @@ def check(plan: Plan, tape: Tape) -> None:
     With `nan_on_failure` the frames of failed scenes are set to NaN instead.
 
     Raises:
+        setup.room.near[reach],
         UserError: A particle lost, too fast, or not finite.
     """
     setup, found = plan.setup, tape.status.view(-1, 3)

@@ -20,7 +20,7 @@ from neuido.physics.mpm.window.placement import FOLLOWED, PIECE, Window, corners
 from neuido.physics.multibody import contact_kernels
 from neuido.physics.multibody.contact_grid import ContactGrid
 from neuido.physics.multibody.scene_bodies import SceneBodies, checked_body, friction_table
-from neuido.physics.runtime.device import real_of
+from neuido.physics.runtime.device import launch, real_of, torch_stream
 from neuido.physics.runtime.limits import check_memory
 from neuido.types import Body, Particles, ParticleState, Scene
 
@@ -221,6 +221,9 @@ class Setup:
         self.origin.copy_(origin)  # in place: a captured graph reads this memory
         if self.field_origin is not self.origin:
             self.field_origin.copy_(self.origin[self.field_scene])
+        table = [self.origin, self.dx, self.colliders.plane, self.clamp_lower, self.clamp_upper, self.room.index, self.room.near]
+        with torch_stream(self.device):
+            launch(self.kernels.mark_nodes, self.room.count, table, self.device)
 
     def _load_bodies(self) -> None:
         x, v, C, F, mass, volume, held, scene_index, body_index, field_index = ([] for _ in range(10))

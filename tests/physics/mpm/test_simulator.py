@@ -172,7 +172,7 @@ def kernel_cases(stage: Stage):
             {"grid": torch.zeros_like(grid)},
         ),
         "update_grid": (
-            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.room.index,
+            {**{k: place[k] for k in ("origin", "dx", "dt")}, "index": sim.room.index, "near": sim.room.near,
              "chunk": sim.room.chunk, **walls, "gravity": sim.gravity.clone(), "force": stage.force,
              "friction": table.friction.clone(), "grid": grid, "clear": False},
             ["gravity", "force", "friction", "grid"],

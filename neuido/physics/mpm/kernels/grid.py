@@ -28,6 +28,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     kernel = functools.partial(wp.kernel, module=name, enable_backward=enable_backward)
     # a module of their own: a run without gradients never compiles them
     adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
+    adjoint_free = functools.partial(wp.kernel, module=name, enable_backward=False)
 
     met = contact_functions.functions(real, name)
     contact, contact_adjoint, damp_contact, normal_of = met.contact, met.contact_adjoint, met.damp_contact, met.normal_of
@@ -142,6 +143,33 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                         out = damp_contact(out, n, dt, force, s)
         return out
 
+    @adjoint_free
+    def mark_nodes(
+        origin: wp.array(dtype=vec3),
+        dx: wp.array(dtype=real),
+        plane: wp.array2d(dtype=vec4),
+        lower: wp.array2d(dtype=vec3),
+        upper: wp.array2d(dtype=vec3),
+        index: wp.array(dtype=wp.vec4i),
+        near: wp.array(dtype=wp.uint8),
+    ):
+        """Mark the nodes in a collider or a clamp, or within half a cell of one; `update_grid` looks at these alone more closely."""
+        node = wp.tid()
+        s = index[node][3]
+        x = node_position(index[node], origin[s], dx[s])
+        margin = real(0.5) * dx[s]
+        found = int(0)
+        for c in range(plane.shape[1]):
+            if wp.dot(normal_of(plane[s, c]), x) <= plane[s, c][3] + margin:
+                found = 1
+        around = vec3(margin, margin, margin)
+        for b in range(lower.shape[1]):
+            l = lower[s, b] - around
+            u = upper[s, b] + around
+            if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
+                found = 1
+        near[node] = wp.uint8(found)
+
     @kernel
     def update_grid(
         origin: wp.array(dtype=vec3),
@@ -155,12 +183,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         lower: wp.array2d(dtype=vec3),
         upper: wp.array2d(dtype=vec3),
         index: wp.array(dtype=wp.vec4i),
+        near: wp.array(dtype=wp.uint8),
         chunk: int,
         grid: wp.array(dtype=vec4),
         velocity: wp.array(dtype=vec4),
         clear: bool,
     ):
-        """Compute the velocity of each node from its momentum and mass; zero for an empty node.
+        """Compute the velocity of each node from its momentum and mass; zero for an empty node. `near` is that of `mark_nodes`.
 
         `clear` empties the nodes for the next scatter, and leaves what an empty one has: no particle gives it weight.
         """
@@ -173,10 +202,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                     grid[node] = vec4(real(0.0), real(0.0), real(0.0), real(0.0))
                 s = index[node][3]
                 x = node_position(index[node], origin[s], dx[s])
-                if not is_clamped(x, s, lower, upper):
-                    v0 = vec3(g[0], g[1], g[2]) / g[3]
-                    u = push(v0, x, dt[s], gravity[s], force, s)
-                    out = collide(u, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
+                v0 = vec3(g[0], g[1], g[2]) / g[3]
+                out = push(v0, x, dt[s], gravity[s], force, s)
+                if near[node] != wp.uint8(0):
+                    if is_clamped(x, s, lower, upper):
+                        out = vec3(real(0.0), real(0.0), real(0.0))
+                    else:
+                        out = collide(out, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
             if g[3] > real(0.0) or not clear:
                 velocity[node] = vec4(out[0], out[1], out[2], real(0.0))
 
@@ -193,6 +225,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         lower: wp.array2d(dtype=vec3),
         upper: wp.array2d(dtype=vec3),
         index: wp.array(dtype=wp.vec4i),
+        near: wp.array(dtype=wp.uint8),
         chunk: int,
         grid: wp.array(dtype=vec4),
         a_velocity: wp.array(dtype=vec4),
@@ -214,12 +247,16 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
             if g[3] > real(0.0):
                 s = index[node][3]
                 x = node_position(index[node], origin[s], dx[s])
-                if not is_clamped(x, s, lower, upper):
+                planes = int(0)
+                free = bool(True)
+                if near[node] != wp.uint8(0):
+                    planes = kind.shape[1]
+                    free = not is_clamped(x, s, lower, upper)
+                if free:
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
                     av = a_velocity[node]
                     a = vec3(av[0], av[1], av[2])
-                    planes = kind.shape[1]
                     for r in range(planes):
                         c = planes - 1 - r
                         n = normal_of(plane[s, c])
@@ -282,6 +319,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
     return SimpleNamespace(
         add_viscous_stress=add_viscous_stress,
         add_viscous_stress_adjoint=add_viscous_stress_adjoint,
+        mark_nodes=mark_nodes,
         update_grid=update_grid,
         update_grid_adjoint=update_grid_adjoint,
         functions=SimpleNamespace(push=push),

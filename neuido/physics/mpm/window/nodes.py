@@ -24,6 +24,7 @@ class Nodes:
         count: Number of nodes of all fields.
         size: Nodes along each axis.
         index: Place along each axis, and scene, of each node, (count, 4) int32.
+        near: Whether a node is in or near a collider or clamp, (count,) uint8; `mark_nodes` of the kernels writes it.
         chunk: Nodes of one thread: on the CPU a column, since calling a thread costs as much there as a node.
         contact: Contact between bodies with fields of their own, which needs memory for each node; None where there are none.
     """
@@ -35,6 +36,7 @@ class Nodes:
         axes = (torch.arange(n, dtype=torch.int32) for n in shape)
         s, i, j, k = torch.meshgrid(fields.int().cpu(), *axes, indexing="ij")
         self.index = torch.stack([i, j, k, s], dim=-1).reshape(-1, 4).to(device)
+        self.near = torch.ones(self.count, dtype=torch.uint8, device=device)
         self.chunk = self.shape[3] if device.type == "cpu" else 1
         self.contact: ContactGrid | None = None
         self._scratch: dict[str, Tensor] = {}
