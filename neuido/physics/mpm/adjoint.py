@@ -62,9 +62,10 @@ def run_backward(
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
     a_shrinkage, a_loss, a_body_friction = a_fixed[SHRINKAGE - STATES : SOLIDS - STATES]
     parameters = any(wanted[STATES + 1 : STATES + 4])
-    now = [torch.zeros_like(t) for t in inputs[:STATES]]
-    then = [torch.empty_like(t) for t in now]
-    scratch, a_tau, other, a_trial = (torch.empty_like(now[3]) for _ in range(4))
+    now, then = ([tape.scratch(f"{name} {i}", t) for i, t in enumerate(inputs[:STATES])] for name in ("now", "then"))
+    for t in now:
+        t.zero_()
+    scratch, a_tau, other, a_trial = (tape.scratch(name, inputs[3]) for name in ("tau", "a_tau", "trial", "a_trial"))
     a_velocity, a_grid = setup.room.scratch("a_velocity"), setup.room.scratch("a_grid")
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
@@ -158,7 +159,7 @@ def run_backward(
         if solids is not None:
             solids.end_adjoint()
         of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
-    return [*now, *a_fixed, *of_laws]
+    return [*(t.clone() for t in now), *a_fixed, *of_laws]
 
 
 def recompute(

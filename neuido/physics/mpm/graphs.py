@@ -27,6 +27,8 @@ CAPACITY = 4
 class CachedRollout:
     """A rollout that runs eagerly and reuses its tape for inputs of the same shapes.
 
+    On the CPU it also copies the inputs into the same memory in each run: launches on the memory of an earlier one are packed already.
+
     Args:
         plan: The rollout.
         keep_all: Whether the tape stores every substep, as a backward pass needs it, or the frames alone.
@@ -36,6 +38,7 @@ class CachedRollout:
         self.tape = new_tape(plan, keep_all)
         self.room = plan.setup.room  # a captured graph uses its memory
         self.serial = 0
+        self.inputs: list[Tensor] = []
 
     def forward(self, plan: Plan, inputs: Sequence[Tensor]) -> int:
         """Run with new inputs and return the serial number of the run."""
@@ -52,12 +55,22 @@ class CachedRollout:
         return self._backward(plan, inputs, gradients, wanted)
 
     def _forward(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
-        run_forward(plan, inputs, self.tape)
+        run_forward(plan, self._own(inputs), self.tape)
 
     def _backward(
         self, plan: Plan, inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], wanted: Sequence[bool]
     ) -> list[Tensor | None]:
-        return run_backward(plan, inputs, self.tape, gradients, wanted)
+        return run_backward(plan, self.inputs or inputs, self.tape, gradients, wanted)
+
+    def _own(self, inputs: Sequence[Tensor]) -> Sequence[Tensor]:
+        """Copy the inputs of a run into the memory of this rollout, and return it; on a GPU return the inputs."""
+        if self.room.device.type != "cpu":
+            return inputs
+        if not self.inputs:
+            self.inputs = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
+        for own, given in zip(self.inputs, inputs, strict=True):
+            own.copy_(given)
+        return self.inputs
 
 
 class CapturedRollout(CachedRollout):
@@ -151,7 +164,7 @@ class RolloutCache:
         """Return the memory of the tapes [bytes], which later rollouts use again."""
         with self.lock:
             tapes = [rollout.tape for rollout in self._rollouts.values()]
-            own = sum(t.numel() * t.element_size() for tape in tapes for t in tape if isinstance(t, Tensor))
+            own = sum(t.numel() * t.element_size() for tape in tapes for t in (*tape, *tape.memory.values()) if isinstance(t, Tensor))
             return own + sum(cache.held_bytes() for cache in self._single.values())
 
     def clear(self) -> None:

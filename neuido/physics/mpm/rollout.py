@@ -52,13 +52,23 @@ class Tape(NamedTuple):
     """Nodal velocity of each substep, (T, nodes, 4), or None."""
     whole: bool
     """Whether a backward pass may follow."""
-    solids: SolidTape | None = None
+    solids: SolidTape | None
     """Record of the solids in every substep; None without solids."""
+    memory: dict[str, Tensor]
+    """Memory that `scratch` hands out."""
 
     @property
     def states(self) -> tuple[Tensor, ...]:
         """Frames of x, v, C, F and the history."""
         return self[:STATES]
+
+    def scratch(self, name: str, like: Tensor) -> Tensor:
+        """Return memory of the shape of a tensor; on the CPU the same in each run, since new pages and new addresses cost time there."""
+        if like.device.type != "cpu":
+            return torch.empty_like(like)
+        if name not in self.memory or self.memory[name].shape != like.shape:
+            self.memory[name] = torch.empty_like(like)
+        return self.memory[name]
 
 
 def new_tape(plan: Plan, keep_all: bool) -> Tape:
@@ -80,7 +90,7 @@ def new_tape(plan: Plan, keep_all: bool) -> Tape:
     grid, velocity = (setup.mass.new_empty(plan.steps, setup.room.count, 4) if more else None for _ in range(2))
     rest_x, rest_F = (torch.empty_like(t) if plan.compensated else None for t in (setup.state.x, setup.state.F))
     solids = None if setup.solids is None else new_solid_tape(setup.solids, plan.steps)
-    return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all, solids)
+    return Tape(x, v, C, F, history, status, lowest, since, rest_x, rest_F, tau, trial, grid, velocity, keep_all, solids, {})
 
 
 def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | None = None) -> None:
@@ -98,8 +108,8 @@ def run_forward(plan: Plan, inputs: Sequence[Tensor], tape: Tape, steps: int | N
     for frame, t in zip(tape.states, inputs):
         frame[0] = t
     now = tuple(frame[0] for frame in tape.states)
-    spare = [tuple(torch.empty_like(t) for t in now) for _ in range(2)] if stride > 1 else []
-    scratch, other = torch.empty_like(now[3]), torch.empty_like(now[3])
+    spare = [tuple(tape.scratch(f"spare {k} {i}", t) for i, t in enumerate(now)) for k in range(2)] if stride > 1 else []
+    scratch, other = tape.scratch("tau", now[3]), tape.scratch("trial", now[3])
     copies = setup.device.type == "cpu"
     # the grid update zeroes the nodes as it reads them, which saves a pass
     clears = copies and tape.grid is None and setup.contact is None and tape.solids is None
@@ -414,6 +424,7 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
         setup.clamp_lower,
         setup.clamp_upper,
         setup.room.index[reach],
+        setup.room.near[reach],
         setup.room.chunk,
     ]
 
@@ -424,7 +435,6 @@ def check(plan: Plan, tape: Tape) -> None:
     With `nan_on_failure` the frames of failed scenes are set to NaN instead.
 
     Raises:
-        setup.room.near[reach],
         UserError: A particle lost, too fast, or not finite.
     """
     setup, found = plan.setup, tape.status.view(-1, 3)
