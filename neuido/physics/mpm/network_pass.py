@@ -1,6 +1,6 @@
 """Kernels of a whole substep of a particle under objective networks (float32): gather, correction, stress, scatter; and their adjoints.
 
-A warp processes 32 particles of one scene, as in `fused`, whose networks these kernels contain.
+A warp processes 32 or 16 particles of one scene, as in `fused`, whose networks these kernels contain.
 """
 
 import functools
@@ -15,7 +15,7 @@ from neuido.physics.runtime.once import cached
 
 
 @cached
-def build(width: int, kind: str, corrects: str | None, turns: int) -> SimpleNamespace:
+def build(width: int, kind: str, corrects: str | None, turns: int, per_warp: int) -> SimpleNamespace:
     """Return the kernels `advance` and `retreat`.
 
     Args:
@@ -23,13 +23,15 @@ def build(width: int, kind: str, corrects: str | None, turns: int) -> SimpleName
         kind: Read-out of the elastic law, `fused.STRESS` or `fused.BOUNDED`.
         corrects: Read-out of the plastic law, `fused.CORRECTION` or `fused.RETURN`; None without a plastic law.
         turns: As for `particle_functions.functions`.
+        per_warp: Particles of a warp, as for `fused.networks`.
     """
     start_warp()
-    name = f"neuido.substep.{width}.{kind}.{corrects or 'elastic'}.{turns}"
+    name = f"neuido.substep.{width}.{kind}.{corrects or 'elastic'}.{turns}.{per_warp}"
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))  # as in `fused`
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
     func = functools.partial(wp.func, module=name)
-    own, layers, move = fused.readout(kind, name), fused.networks(width, name), particle_functions.functions(wp.float32, name, turns)
+    own, layers = fused.readout(kind, name), fused.networks(width, name, per_warp)
+    move = particle_functions.functions(wp.float32, name, turns)
     features_of, stress_of = own.features_of, own.value
     stress_coefficients, stress_gradient = own.coefficients, own.gradient
     inner, inner_adjoint, inner_invariants, outputs = layers.network, layers.network_adjoint, own.strain_invariants, layers.outputs

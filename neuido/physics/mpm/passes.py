@@ -23,6 +23,9 @@ TURNS: int | None = None
 """Turns of the loops over nodes that are written out; None: `UNROLLED` on CUDA, where it is faster, and `ROLLED` on the CPU, which compiles
 it sooner."""
 
+PER_WARP: int | None = None
+"""Particles of a warp of `NetworkPass`, 16 or 32; None: `particles_per_warp` of the number of particles."""
+
 BY_DEFAULT = {"cuda": "fused"}
 """The kernels that `fusion="auto"` takes on each type of device; `separate` on others."""
 
@@ -90,11 +93,13 @@ class Pass:
     plastic: Engine | None
     block = fused.BLOCK
     """Threads per block."""
+    per_warp = 32
+    """Particles of a warp."""
 
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
         setup = plan.setup
         self.plan, self.device, self.corrects = plan, setup.device, plan.plasticity is not None
-        self.warps = setup.warps = fused.warps_of(setup.particles.offsets, setup.device)
+        self.warps = setup.warps = fused.warps_of(setup.particles.offsets, setup.device, self.per_warp)
         scenes = [setup.held_now, setup.origin, setup.dx, setup.dt, setup.room.size]
         self.table = [*self.warps, *scenes, inputs[STATES], setup.sorted_volume]
 
@@ -176,6 +181,11 @@ def _width(law: Law) -> int:
     return law.weights[0].shape[-2] if hasattr(law, "readout") else 0  # type: ignore[attr-defined]
 
 
+def particles_per_warp(count: int) -> int:
+    """Return how many of `count` particles a warp takes, so that a GPU of some hundred schedulers has several warps for each."""
+    return 32
+
+
 class TransferPass(Pass):
     """Laws of any kind between launches of the transfers; arguments as for `Pass`."""
 
@@ -224,13 +234,15 @@ class NetworkPass(Pass):
     plastic: fused.FusedEngine | None
 
     def __init__(self, plan: Plan, inputs: Sequence[Tensor]) -> None:
+        self.per_warp = PER_WARP or particles_per_warp(len(plan.setup.mass))
         super().__init__(plan, inputs)
         particles = plan.setup.particles
         elastic, plastic = plan.elasticity, plan.plasticity
-        self.elastic = fused.FusedEngine(elastic, inputs[FIXED : plan.split], particles)
-        self.plastic = None if plastic is None else fused.FusedEngine(plastic, inputs[plan.split :], particles)
+        self.elastic = fused.FusedEngine(elastic, inputs[FIXED : plan.split], particles, self.per_warp)
+        self.plastic = None if plastic is None else fused.FusedEngine(plastic, inputs[plan.split :], particles, self.per_warp)
         corrects = None if plastic is None else plastic.readout  # type: ignore[attr-defined]
-        self.kernels = network_pass.build(self.elastic.width, self.elastic.law.readout, corrects, _turns(plan))  # type: ignore[attr-defined]
+        readout = self.elastic.law.readout  # type: ignore[attr-defined]
+        self.kernels = network_pass.build(self.elastic.width, readout, corrects, _turns(plan), self.per_warp)
 
     def _packed(self, engine: fused.FusedEngine | None) -> list:
         if engine is None:

@@ -8,6 +8,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import DruckerPrager, FixedCorotated, Fluid, NeoHookean, Sigma, Snow, VolumetricReset, VonMises, stack
 from neuido.physics.laws.neural.bounded import BoundedElastic, FullPlastic
 from neuido.physics.laws.neural.networks import ObjectiveElastic, ObjectivePlastic
+from neuido.physics.mpm import passes
 from neuido.physics.mpm.passes import ClassicalPass, NetworkPass, TransferPass, choose
 from neuido.physics.mpm.plan import FIXED, STATES, Plan
 from neuido.physics.mpm.simulator import Simulator
@@ -119,7 +120,9 @@ def networks(kind, plastic=ObjectivePlastic, seed: int = 0):
 @pytest.mark.parametrize(
     ("kind", "plastic"), [(ObjectiveElastic, ObjectivePlastic), (BoundedElastic, ObjectivePlastic), (BoundedElastic, FullPlastic)]
 )
-def test_networks_inside_the_kernels_are_those_outside(kind, plastic):
+@pytest.mark.parametrize("per_warp", [16, 32])
+def test_networks_inside_the_kernels_are_those_outside(kind, plastic, per_warp, monkeypatch):
+    monkeypatch.setattr(passes, "PER_WARP", per_warp)
     laws = networks(kind, plastic)
     twins = run(simulator("separate", WALLS["separate"], torch.float32), laws, check=False)
     assert_agree(run(simulator("fused", WALLS["separate"], torch.float32), laws, check=False), twins, torch.float32)

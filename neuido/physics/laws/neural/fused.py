@@ -34,6 +34,9 @@ BATCH, BATCH_NUMBERS = 16, 2**27
 """Most substeps whose activations are kept for one product of matrices, and numbers that they may take: half a gigabyte. A product and a
 sum for each substep took longer than the networks (few-shot on an H200: 47 of 171 ms a step)."""
 
+TURNS = 1
+"""Turns of the loop over the tiles of the first layer that are written out."""
+
 BLOCK = 32
 """Threads per block; with one warp per block, the warps of a small body spread evenly over the multiprocessors."""
 
@@ -66,17 +69,19 @@ def correction(own: SimpleNamespace, name: str, kind: str) -> SimpleNamespace:
     return SimpleNamespace(features_of=features_of, value=own.correction_of, coefficients=coefficients, gradient=own.correction_gradient)
 
 
-def networks(width: int, name: str) -> SimpleNamespace:
+def networks(width: int, name: str, per_warp: int = 32) -> SimpleNamespace:
     """Return the functions of a network of one width and their types: its values, its adjoint, and the outputs in what the values keep.
 
     Args:
         width: Hidden width, one of `WIDTHS`.
         name: Name of the Warp module that the functions belong to.
+        per_warp: Particles of a warp, 16 or 32, in its first lanes.
     """
     tiles = width // 8
     kept = 8 * tiles + 4
     sizes = {
-        "H": width, "NT": tiles, "KEPT": kept, "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
+        "H": width, "MT": per_warp // 16, "NT": tiles, "TURNS": TURNS, "KEPT": kept,
+        "SIZE1": 2 * tiles * 128, "SIZE2": tiles * tiles * 128, "SIZE3": tiles * 128,
         "SIZE3T": tiles * 128,
     }  # fmt: skip
     vec4 = wp.types.vector(length=4, dtype=wp.float32)
@@ -101,13 +106,16 @@ def networks(width: int, name: str) -> SimpleNamespace:
 
 
 @cached
-def build(width: int, kind: str) -> SimpleNamespace:
-    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `BOUNDED`, `CORRECTION` or `RETURN`."""
+def build(width: int, kind: str, per_warp: int = 32) -> SimpleNamespace:
+    """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `BOUNDED`, `CORRECTION` or `RETURN`.
+
+    `per_warp` is as for `networks`.
+    """
     start_warp()
-    name = f"neuido.fused.{width}.{kind}"
+    name = f"neuido.fused.{width}.{kind}.{per_warp}"
     # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
     wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
-    own, layers = readout(kind, name), networks(width, name)
+    own, layers = readout(kind, name), networks(width, name, per_warp)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
     strain_invariants, features_of = own.strain_invariants, own.features_of
     value, coefficients, gradient = own.value, own.coefficients, own.gradient
@@ -168,12 +176,12 @@ def build(width: int, kind: str) -> SimpleNamespace:
 
 
 @cached(limit=16)
-def warps_of(offsets: tuple[int, ...], device: torch.device) -> list[Tensor]:
-    """Return the scene, the first particle and the end of every warp.
+def warps_of(offsets: tuple[int, ...], device: torch.device, per_warp: int = 32) -> list[Tensor]:
+    """Return the scene, the first particle and the end of every warp of up to `per_warp` particles.
 
     The tensors are cached, since nothing may be copied from the host while a graph is captured.
     """
-    table = [(s, p, min(p + 32, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, 32)]
+    table = [(s, p, min(p + per_warp, j)) for s, (i, j) in enumerate(zip(offsets[:-1], offsets[1:])) for p in range(i, j, per_warp)]
     return [torch.tensor(column, dtype=torch.int32, device=device) for column in zip(*table)]
 
 
@@ -204,13 +212,14 @@ class FusedEngine(Engine):
         law: The law.
         tensors: Result of `law.tensors()`, in the dtype and on the device of the rollout.
         particles: The scene of each particle.
+        per_warp: As for `networks`.
     """
 
-    def __init__(self, law, tensors: Sequence[Tensor], particles: Particles):
+    def __init__(self, law, tensors: Sequence[Tensor], particles: Particles, per_warp: int = 32):
         super().__init__(law, tensors, particles)
         W1, b1, W2, b2, W3, b3 = self.tensors
         self.width, self.outputs = W1.shape[1], W3.shape[1]
-        self.kernels = build(self.width, law.readout)
+        self.kernels = build(self.width, law.readout, per_warp)
         shared, own = max(t.shape[0] for t in (W1, b1, W2, b2)), max(W3.shape[0], b3.shape[0])
         first = W1.new_zeros(shared, INPUTS, self.width)
         first[:, :9], first[:, 9] = W1.mT, b1
@@ -220,7 +229,7 @@ class FusedEngine(Engine):
         self.first, self.second, self.last = first, second, last
         self.rows = (shared, own)
         self.packed = [t.view(-1) for t in (_fragments(first), _fragments(second), bias, _fragments(last), offset)]
-        self.warps = warps_of(particles.offsets, W1.device)
+        self.warps = warps_of(particles.offsets, W1.device, per_warp)
 
     @property
     def threads(self) -> int:

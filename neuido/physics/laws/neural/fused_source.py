@@ -1,4 +1,4 @@
-"""CUDA source of the fused networks: three layers for the 32 particles of a warp on the tensor cores, and their adjoint.
+"""CUDA source of the fused networks: three layers for the 32 or 16 particles of a warp on the tensor cores, and their adjoint.
 
     m16n8k8: a lane (g, t) = (lane / 4, lane % 4) holds rows g, g + 8 and columns 2t, 2t + 1 of a 16 x 8 result,
     and of the next operand the same columns, once the rows of its weights are permuted (`fused._order`).
@@ -36,10 +36,16 @@ TOOLS = """
         product(c, hi, w.z, w.w);
         product(c, hi, w.x, w.y);
     }};
-    // the features of the warp's particles as operands, two tiles of 16 rows, two of 8 columns
-    float xh[2][2][4], xl[2][2][4];
+    // the same with the residues in a sum of their own, since a product waits for the one before that adds to the same sum
+    auto apart = [&](float* c, float* r, const float* hi, const float* lo, float4 w) {{
+        product(r, lo, w.x, w.y);
+        product(c, hi, w.x, w.y);
+        product(r, hi, w.z, w.w);
+    }};
+    // the features of the warp's particles as operands, tiles of 16 rows, two of 8 columns
+    float xh[{MT}][2][4], xl[{MT}][2][4];
     #pragma unroll
-    for (int m = 0; m < 2; ++m) {{
+    for (int m = 0; m < {MT}; ++m) {{
         float c[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
         #pragma unroll
         for (int i = 0; i < 10; ++i) {{
@@ -68,24 +74,27 @@ FORWARD = (
     + TOOLS
     + """
     const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3};
-    float z[2][{NT}][4];
+    float z[{MT}][{NT}][4];
     #pragma unroll
     for (int n = 0; n < {NT}; ++n) {{
         const float2 b = *reinterpret_cast<const float2*>(B2.data + shared * {H} + 8 * n + 2 * t);
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {{ z[m][n][0] = b.x; z[m][n][1] = b.y; z[m][n][2] = b.x; z[m][n][3] = b.y; }}
+        for (int m = 0; m < {MT}; ++m) {{ z[m][n][0] = b.x; z[m][n][1] = b.y; z[m][n][2] = b.x; z[m][n][3] = b.y; }}
     }}
-    #pragma unroll 1
+    #pragma unroll {TURNS}
     for (int j = 0; j < {NT}; ++j) {{
         const float4 w0 = weights(W1, one, j), w1 = weights(W1, one, {NT} + j);
-        float hi[2][4], lo[2][4];
+        float hi[{MT}][4], lo[{MT}][4];
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {{
-            float c[4] = {{0, 0, 0, 0}};
-            exact(c, xh[m][0], xl[m][0], w0);
-            exact(c, xh[m][1], xl[m][1], w1);
+        for (int m = 0; m < {MT}; ++m) {{
+            float c[4] = {{0, 0, 0, 0}}, r[4] = {{0, 0, 0, 0}};
+            apart(c, r, xh[m][0], xl[m][0], w0);
+            apart(c, r, xh[m][1], xl[m][1], w1);
             #pragma unroll
-            for (int i = 0; i < 4; ++i) c[i] *= sigmoid(c[i]);
+            for (int i = 0; i < 4; ++i) {{
+                c[i] += r[i];
+                c[i] *= sigmoid(c[i]);
+            }}
             split(c, hi[m], lo[m]);
         }}
         #pragma unroll
@@ -95,22 +104,26 @@ FORWARD = (
             exact(z[1][n], hi[1], lo[1], w);
         }}
     }}
-    float y[2][4] = {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}};
+    float y[{MT}][4] = {{}}, rest[{MT}][4] = {{}};
     #pragma unroll
     for (int j = 0; j < {NT}; ++j) {{
         const float4 w = weights(W3, three, j);
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {{
+        for (int m = 0; m < {MT}; ++m) {{
             float c[4], hi[4], lo[4];
             #pragma unroll
             for (int i = 0; i < 4; ++i) c[i] = z[m][j][i] * sigmoid(z[m][j][i]);
             split(c, hi, lo);
-            exact(y[m], hi, lo, w);
+            apart(y[m], rest[m], hi, lo, w);
         }}
     }}
+    #pragma unroll
+    for (int m = 0; m < {MT}; ++m)
+        #pragma unroll
+        for (int i = 0; i < 4; ++i) y[m][i] += rest[m][i];
     wp::vec_t<{KEPT}, wp::float32> out;
     #pragma unroll
-    for (int m = 0; m < 2; ++m)
+    for (int m = 0; m < {MT}; ++m)
         #pragma unroll
         for (int n = 0; n < {NT}; ++n)
             #pragma unroll
@@ -120,11 +133,11 @@ FORWARD = (
     for (int i = 0; i < 4; ++i) {{
         float v = 0.0f;
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < {MT}; ++m)
             #pragma unroll
             for (int u = 0; u < 2; ++u) {{
                 const float q = __shfl_sync(full, y[m][2 * u + (i & 1)], 4 * (lane & 7) + (i >> 1));
-                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+                if (m == (lane >> 4) % {MT} && u == ((lane >> 3) & 1)) v = q;
             }}
         out[{KEPT} - 4 + i] = v + B3.data[scene * 4 + i];
     }}
@@ -155,9 +168,9 @@ BACKWARD = (
     + TOOLS
     + """
     const int one = shared * {SIZE1}, two = shared * {SIZE2}, three = scene * {SIZE3T};
-    float z[2][{NT}][4], gy_rows[2][2][4], gh[2][4], gl[2][4];
+    float z[{MT}][{NT}][4], gy_rows[{MT}][2][4], gh[{MT}][4], gl[{MT}][4];
     #pragma unroll
-    for (int m = 0; m < 2; ++m) {{
+    for (int m = 0; m < {MT}; ++m) {{
         #pragma unroll
         for (int n = 0; n < {NT}; ++n)
             #pragma unroll
@@ -187,7 +200,7 @@ BACKWARD = (
         const float4 w = weights(W3T, three, j);
         float part[8] = {{0, 0, 0, 0, 0, 0, 0, 0}};
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {{
+        for (int m = 0; m < {MT}; ++m) {{
             float c[4] = {{0, 0, 0, 0}};
             exact(c, gh[m], gl[m], w);
             #pragma unroll
@@ -221,32 +234,32 @@ BACKWARD = (
             P3.data[(warp * {NT} + j) * 32 + lane] += part[0];
         }}
     }}
-    float a[2][{NT}][4];
+    float a[{MT}][{NT}][4];
     #pragma unroll
     for (int n = 0; n < {NT}; ++n)
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < {MT}; ++m)
             #pragma unroll
             for (int i = 0; i < 4; ++i) a[m][n][i] = 0.0f;
     #pragma unroll
     for (int j = 0; j < {NT}; ++j) {{
-        float hi[2][4], lo[2][4];
-        split(z[0][j], hi[0], lo[0]);
-        split(z[1][j], hi[1], lo[1]);
+        float hi[{MT}][4], lo[{MT}][4];
+        #pragma unroll
+        for (int m = 0; m < {MT}; ++m) split(z[m][j], hi[m], lo[m]);
         #pragma unroll
         for (int n = 0; n < {NT}; ++n) {{
             const float4 w = weights(W2T, two, j * {NT} + n);
-            exact(a[0][n], hi[0], lo[0], w);
-            exact(a[1][n], hi[1], lo[1], w);
+            #pragma unroll
+            for (int m = 0; m < {MT}; ++m) exact(a[m][n], hi[m], lo[m], w);
         }}
     }}
-    float gx[2][2][4] = {{{{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}, {{{{0, 0, 0, 0}}, {{0, 0, 0, 0}}}}}};
+    float gx[{MT}][2][4] = {{}};
     #pragma unroll
     for (int n = 0; n < {NT}; ++n) {{
         const float4 w0 = weights(W1, one, n), w1 = weights(W1, one, {NT} + n);
         const float4 v0 = weights(W1T, one, 2 * n), v1 = weights(W1T, one, 2 * n + 1);
         #pragma unroll
-        for (int m = 0; m < 2; ++m) {{
+        for (int m = 0; m < {MT}; ++m) {{
             float c[4] = {{0, 0, 0, 0}}, hi[4], lo[4];
             exact(c, xh[m][0], xl[m][0], w0);
             exact(c, xh[m][1], xl[m][1], w1);
@@ -270,11 +283,11 @@ BACKWARD = (
     for (int i = 0; i < 9; ++i) {{
         float v = 0.0f;
         #pragma unroll
-        for (int m = 0; m < 2; ++m)
+        for (int m = 0; m < {MT}; ++m)
             #pragma unroll
             for (int u = 0; u < 2; ++u) {{
                 const float q = __shfl_sync(full, gx[m][i >> 3][2 * u + (i & 1)], 4 * (lane & 7) + ((i & 7) >> 1));
-                if (m == lane >> 4 && u == ((lane >> 3) & 1)) v = q;
+                if (m == (lane >> 4) % {MT} && u == ((lane >> 3) & 1)) v = q;
             }}
         out[i] = v;
     }}
