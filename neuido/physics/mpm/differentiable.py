@@ -20,6 +20,32 @@ FRICTION = 8
 """Index of the friction input; the number of colliders, hence its width, differs between scenes."""
 
 
+class _Permuted(torch.autograd.Function):
+    """A permutation whose gradient is permuted back; torch adds the gradient of any index to zeros, number by number."""
+
+    @staticmethod
+    def forward(ctx: Any, t: Tensor, order: Tensor, inverse: Tensor, axis: int) -> Tensor:
+        ctx.axis = axis
+        ctx.save_for_backward(inverse)
+        return t.index_select(axis, order)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        return gradient.index_select(ctx.axis, *ctx.saved_tensors), None, None, None
+
+
+def permuted(t: Tensor, order: Tensor, inverse: Tensor, axis: int = 0) -> Tensor:
+    """Return a copy of t in another order along an axis.
+
+    Args:
+        t: Any tensor.
+        order: Index of each element of the result, a permutation.
+        inverse: The inverse permutation.
+        axis: The axis.
+    """
+    return _Permuted.apply(t, order, inverse, axis)
+
+
 def run(
     plan: Plan, inputs: tuple[Tensor, ...], segment: int | None, cache: RolloutCache, pool: ThreadPoolExecutor | None
 ) -> tuple[Tensor, ...]:

@@ -24,7 +24,7 @@ from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.base import ElasticLaw, PlasticLaw, strain_limit
 from neuido.physics.laws.composite import laws_of_bodies
 from neuido.physics.mpm import inputs
-from neuido.physics.mpm.differentiable import run
+from neuido.physics.mpm.differentiable import permuted, run
 from neuido.physics.mpm.graphs import RolloutCache
 from neuido.physics.mpm.plan import Plan
 from neuido.physics.mpm.state import Setup
@@ -371,7 +371,7 @@ class Simulator:
         plan = Plan(self.setup, elasticity, plasticity, steps, every, tables, nan_on_failure, compensated=compensated)
         law_tensors = [t.to(self.device, self.dtype).contiguous() for t in plan.law_tensors()]
         history = mass.new_zeros(len(mass), plan.layout.width)
-        start = [t[self.order] for t in (*given.state, history, mass)]
+        start = [permuted(t, self.order, self.inverse) for t in (*given.state, history, mass)]
         viscosity = given.viscosity
         if viscosity is not None and len(viscosity) > self.scene_count:
             viscosity = viscosity[self.order]
@@ -384,7 +384,7 @@ class Simulator:
         pool = None if self.setup.solids is not None or self.setup.attached is not None else self.pool
         with self.cache.lock:
             frames = run(plan, (*start, pull, given.force, given.friction, *optional, *law_tensors), segment, self.cache, pool)
-            x, v, C, F, history = (t[:, self.inverse] for t in frames[:5])
+            x, v, C, F, history = (permuted(t, self.inverse, self.order, 1) for t in frames[:5])
             states, impulses = (t.clone() for t in frames[5:]) if len(frames) > 5 else (None, None)
         dts = tuple(scene.dt for scene in self.scenes)
         recorder = plan.recorder
