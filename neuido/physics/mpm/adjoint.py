@@ -58,7 +58,7 @@ def run_backward(
     setup, k = plan.setup, plan.setup.kernels
     mass_before = None
     mass, pull, force, friction, viscosity = inputs[STATES : STATES + 5]
-    a_fixed = [torch.zeros_like(t) for t in inputs[STATES:FIXED]]
+    a_fixed = [tape.scratch(f"fixed {i}", t).zero_() for i, t in enumerate(inputs[STATES:FIXED])]
     a_mass, a_pull, a_force, a_friction, a_viscosity = a_fixed[:5]
     a_shrinkage, a_loss, a_body_friction = a_fixed[SHRINKAGE - STATES : SOLIDS - STATES]
     parameters = any(wanted[STATES + 1 : STATES + 4])
@@ -69,9 +69,11 @@ def run_backward(
     a_velocity, a_grid = setup.room.scratch("a_velocity"), setup.room.scratch("a_grid")
     with torch_stream(setup.device):
         elastic, plastic = plan.engines(inputs)
-        elastic.start_adjoint(wanted[FIXED : plan.split])
-        if plastic is not None:
-            plastic.start_adjoint(wanted[plan.split :])
+        for engine, own in ((elastic, wanted[FIXED : plan.split]), (plastic, wanted[plan.split :])):
+            if engine is not None:
+                engine.start_adjoint(own)
+                name = "elastic" if engine is elastic else "plastic"
+                engine.grads = [None if g is None else tape.scratch(f"{name} {i}", g).zero_() for i, g in enumerate(engine.grads)]
         spin = plan.spin_decay(inputs)
         damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
         solids = solid_loop(plan, inputs, tape.solids)
@@ -159,7 +161,8 @@ def run_backward(
         if solids is not None:
             solids.end_adjoint()
         of_laws = [*elastic.gradients(), *(() if plastic is None else plastic.gradients())]
-    return [*(t.clone() for t in now), *a_fixed, *of_laws]
+    # the memory is that of the next run too
+    return [None if t is None else t.clone() for t in (*now, *a_fixed, *of_laws)]
 
 
 def recompute(

@@ -68,7 +68,7 @@ class Simulator:
         graphs: On CUDA, capture the launches of a rollout as a CUDA graph once per shape and replay it afterwards.
         store: What a forward pass stores of each substep for the backward pass. `state`: x, v, C, F (96 bytes a particle in
             float32); stress, trial gradient and grid are recomputed. `all`: these too (72 bytes more a particle, 32 a node), which is
-            faster. `auto`: `all` if there are at most four nodes per particle, else `state`.
+            faster. `auto`: `all` if there are at most four nodes per particle, on the CPU eight, else `state`.
         grid: Extent of the grid. `domain`: all of it. `window`: a block that follows the matter, so that memory goes with the bodies and
             not with the domain. `auto`: `window` if the nodes of the domain take more than 256 MB and more than the particles.
         on_inversion: What a rollout does where matter turns inside out or collapses (det F below 0.001). `report`: `Frames.events` has
