@@ -124,6 +124,36 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
         return out
 
     @wp.func
+    def has_stretch(Fp: mat, kind: wp.int32):
+        """Return whether `corotated_gradient` applies."""
+        return wp.static(not builtin_svd) and kind == FIXED_COROTATED and one + volume_change(Fp) > flat
+
+    @wp.func
+    def corotated_gradient(Fp: mat, mu: real, lam: real, A: mat):
+        """Return the adjoints of F, mu and lambda without a principal frame.
+
+        With S = A + A^T that of F is 2 mu (S - X) F + lambda (2 J - 1) tr(A) cof F, where V X + X V = S. By the Cayley-Hamilton theorem
+        X = (V^2 S - V S V + S V^2 + I1 (S V - V S) + I2 S) (2 I1 V^2 + 2 J I)^-1, with the invariants of V.
+        """
+        eye = wp.identity(n=3, dtype=real)
+        dJ = volume_change(Fp)
+        E = strain(Fp)
+        D = stretch(E, dJ)
+        V = eye + D
+        b = eye + E
+        first = real(3.0) + wp.trace(D)
+        second = half * (first * first - wp.trace(b))
+        S = A + wp.transpose(A)
+        SV = S * V
+        VS = wp.transpose(SV)
+        bS = b * S
+        X = bS + wp.transpose(bS) - V * SV + first * (SV - VS) + second * S
+        X = X * wp.inverse((two * first) * b + (two * (one + dJ)) * eye)
+        trace = A[0, 0] + A[1, 1] + A[2, 2]
+        grad = (two * mu) * ((S - half * (X + wp.transpose(X))) * Fp) + (trace * lam * (one + two * dJ)) * cofactor(Fp)
+        return grad, wp.ddot(S, E - D), trace * (one + dJ) * dJ
+
+    @wp.func
     def hencky_in_frame(Fp: mat, mu: real, lam: real):
         U, d, _V = frame(Fp)
         e = hencky(d)
@@ -172,6 +202,8 @@ def kernels(real: type, *, enable_backward: bool = False, builtin_svd: bool = Fa
                 grad = grad + (trace * lam / (one + dJ)) * cofactor(Fp)
             shear = wp.ddot(A, strain(Fp))
             bulk = trace * log1p(bounded(dJ))
+        elif has_stretch(Fp, kind):
+            grad, shear, bulk = corotated_gradient(Fp, mu, lam, A)
         else:
             U, d, V = frame(Fp)
             A = wp.transpose(U) * A * U
