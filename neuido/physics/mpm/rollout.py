@@ -260,7 +260,8 @@ def gather(
     setup = plan.setup
     x, _, _, F, history = now
     raw = trial if plan.corrects else then[3]
-    plan.launch(setup.kernels.grid_to_particles, len(x),
+    k = setup.kernels
+    plan.launch(k.grid_to_particles if tape.rest_x is None else k.grid_to_particles_with_rests, len(x),
                 [setup.field, setup.held_now, setup.field_origin, setup.field_dx, setup.field_dt, setup.room.size, velocity, x, F,
                  *then[:3], raw, n, tape.status, setup.span, tape.lowest, tape.since,
                  tape.rest_x, tape.rest_F], plan.block)  # fmt: skip

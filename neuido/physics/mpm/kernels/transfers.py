@@ -14,6 +14,7 @@ about a third of the operations of a plain sum.
 """
 
 import functools
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import warp as wp
@@ -144,86 +145,94 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         a_x[p] = a_x[p] + (slope - wp.transpose(hA) * s0) / h
         a_mass[p] = a_mass[p] + wp.dot(s0, v[p]) + wp.ddot(s1, C[p]) + sums[0, 3]
 
-    @kernel
-    def grid_to_particles(
-        scene: wp.array(dtype=wp.int32),
-        held: wp.array(dtype=wp.uint8),
-        origin: wp.array(dtype=vec3),
-        dx: wp.array(dtype=real),
-        dt: wp.array(dtype=real),
-        nodes: wp.vec3i,
-        velocity: wp.array(dtype=vec4),
-        x: wp.array(dtype=vec3),
-        F: wp.array(dtype=mat33),
-        x_next: wp.array(dtype=vec3),
-        v_next: wp.array(dtype=vec3),
-        C_next: wp.array(dtype=mat33),
-        F_trial: wp.array(dtype=mat33),
-        step: int,
-        status: wp.array(dtype=wp.int32),
-        span: wp.array(dtype=real),
-        lowest: wp.array(dtype=real),
-        since: wp.array(dtype=wp.int32),
-        rest_x: wp.array(dtype=vec3),
-        rest_F: wp.array(dtype=mat33),
-    ):
-        """Compute x, v, C and the trial F of the particles from the nodal velocities.
+    def gather_kernel(decorate: Callable, compensated: bool) -> wp.Kernel:
+        """Return G2P, built with or without the rests of x and F, whose branches all others would pay for."""
 
-        The first particle of a scene that is lost, too fast or not finite writes a code, its index and the step into `status`. If `span`
-        is not empty, it becomes the smallest and the largest x of the particles. A particle with a trial det F below `COLLAPSED` writes
-        the smallest det F into `lowest` and the first such step into `since`. `rest_x` and `rest_F`, if given, accumulate what the
-        rounding of x and F leaves out.
-        """
-        p = wp.tid()
-        s = scene[p]
-        h = dx[s]
-        zero = vec3(real(0.0), real(0.0), real(0.0))
-        if held[p] == wp.uint8(1):
-            x_next[p] = x[p]
-            extend_span(span, x[p][0])
-            v_next[p] = zero
-            C_next[p] = wp.outer(zero, zero)
-            F_trial[p] = F[p]
-            return
-        cells = (x[p] - origin[s]) / h
-        base = first_node(cells, nodes)
-        f = stencil_offset(cells, base)
-        wx = spline(f[0])
-        wy = spline(f[1])
-        wz = spline(f[2])
-        node = flat_index(s, base, nodes)
-        m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
-        v = m[0]
-        C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
-        move = dt[s] * v
-        change = dt[s] * (C * F[p])
-        if rest_x:
-            move += rest_x[p]
-            change += rest_F[p]
-        y = x[p] + move
-        trial = F[p] + change
-        if rest_x:
-            rest_x[p] = move - (y - x[p])
-            rest_F[p] = change - (trial - F[p])
-        x_next[p] = y
-        extend_span(span, y[0])
-        v_next[p] = v
-        C_next[p] = C
-        F_trial[p] = trial
-        J = wp.determinant(trial)
-        if J < wp.static(real(COLLAPSED)):
-            lowest[p] = wp.min(lowest[p], J)
-            if since[p] < 0:
-                since[p] = step
-        code = int(0)
-        if not (dt[s] * dt[s] * wp.dot(v, v) < h * h):
-            code = wp.static(FAST)
-        if not in_grid(y, origin[s], h, nodes):
-            code = wp.max(code, wp.static(LOST))
-        if code > 0:
-            if wp.atomic_cas(status, 3 * s, 0, code) == 0:
-                status[3 * s + 1] = p
-                status[3 * s + 2] = step
+        @decorate
+        def grid_to_particles(
+            scene: wp.array(dtype=wp.int32),
+            held: wp.array(dtype=wp.uint8),
+            origin: wp.array(dtype=vec3),
+            dx: wp.array(dtype=real),
+            dt: wp.array(dtype=real),
+            nodes: wp.vec3i,
+            velocity: wp.array(dtype=vec4),
+            x: wp.array(dtype=vec3),
+            F: wp.array(dtype=mat33),
+            x_next: wp.array(dtype=vec3),
+            v_next: wp.array(dtype=vec3),
+            C_next: wp.array(dtype=mat33),
+            F_trial: wp.array(dtype=mat33),
+            step: int,
+            status: wp.array(dtype=wp.int32),
+            span: wp.array(dtype=real),
+            lowest: wp.array(dtype=real),
+            since: wp.array(dtype=wp.int32),
+            rest_x: wp.array(dtype=vec3),
+            rest_F: wp.array(dtype=mat33),
+        ):
+            """Compute x, v, C and the trial F of the particles from the nodal velocities.
+
+            The first particle of a scene that is lost, too fast or not finite writes a code, its index and the step into `status`. If
+            `span` is not empty, it becomes the smallest and the largest x of the particles. A particle with a trial det F below
+            `COLLAPSED` writes the smallest det F into `lowest` and the first such step into `since`. If `compensated`, `rest_x` and
+            `rest_F` accumulate what the rounding of x and F leaves out.
+            """
+            p = wp.tid()
+            s = scene[p]
+            h = dx[s]
+            zero = vec3(real(0.0), real(0.0), real(0.0))
+            if held[p] == wp.uint8(1):
+                x_next[p] = x[p]
+                extend_span(span, x[p][0])
+                v_next[p] = zero
+                C_next[p] = wp.outer(zero, zero)
+                F_trial[p] = F[p]
+                return
+            cells = (x[p] - origin[s]) / h
+            base = first_node(cells, nodes)
+            f = stencil_offset(cells, base)
+            wx = spline(f[0])
+            wy = spline(f[1])
+            wz = spline(f[2])
+            node = flat_index(s, base, nodes)
+            m = moments(velocity, node, nodes[1], nodes[2], wx, wy, wz)
+            v = m[0]
+            C = (real(4.0) / h) * wp.matrix_from_cols(m[1] - f[0] * v, m[2] - f[1] * v, m[3] - f[2] * v)
+            move = dt[s] * v
+            change = dt[s] * (C * F[p])
+            if wp.static(compensated):
+                move += rest_x[p]
+                change += rest_F[p]
+            y = x[p] + move
+            trial = F[p] + change
+            if wp.static(compensated):
+                rest_x[p] = move - (y - x[p])
+                rest_F[p] = change - (trial - F[p])
+            x_next[p] = y
+            extend_span(span, y[0])
+            v_next[p] = v
+            C_next[p] = C
+            F_trial[p] = trial
+            J = wp.determinant(trial)
+            if J < wp.static(real(COLLAPSED)):
+                lowest[p] = wp.min(lowest[p], J)
+                if since[p] < 0:
+                    since[p] = step
+            code = int(0)
+            if not (dt[s] * dt[s] * wp.dot(v, v) < h * h):
+                code = wp.static(FAST)
+            if not in_grid(y, origin[s], h, nodes):
+                code = wp.max(code, wp.static(LOST))
+            if code > 0:
+                if wp.atomic_cas(status, 3 * s, 0, code) == 0:
+                    status[3 * s + 1] = p
+                    status[3 * s + 2] = step
+
+        return grid_to_particles
+
+    grid_to_particles = gather_kernel(kernel, False)
+    with_rests = gather_kernel(functools.partial(wp.kernel, module=f"{name}.rests", enable_backward=False), True)
 
     @adjoint_kernel
     def grid_to_particles_adjoint(
@@ -290,6 +299,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         particles_to_grid=particles_to_grid,
         particles_to_grid_adjoint=particles_to_grid_adjoint,
         grid_to_particles=grid_to_particles,
+        grid_to_particles_with_rests=with_rests,
         grid_to_particles_adjoint=grid_to_particles_adjoint,
         **vars(grid_functions.build(real, enable_backward)),
     )
