@@ -19,6 +19,7 @@ from neuido.physics.laws.classical import (
     Sigma,
     VonMises,
 )
+from neuido.physics.runtime.device import launch
 from neuido.types import Particles
 
 EYE = torch.eye(3, dtype=torch.float64)
@@ -532,3 +533,19 @@ def test_material_builds_what_the_experiment_names():
     pair = laws.material({"law": "fixed_corotated", "young": 1e5, "poisson": 0.3}, {"law": "drucker_prager", "friction_angle": 30})
     assert isinstance(pair[0], FixedCorotated)
     assert isinstance(pair[1], DruckerPrager)
+
+
+@pytest.mark.parametrize("stretches", [[1.4, 1.1, 0.7], [3.0, 0.9, 0.2], [1.02, 1.0, 0.99]])
+def test_the_corotated_adjoint_needs_no_principal_frame(stretches):
+    """Without a frame and, as `svd3` has one, with it."""
+    F = with_stretches([stretches] * 4)
+    A = torch.randn(4, 3, 3, dtype=torch.float64, generator=seeded(7))
+    found = []
+    for builtin_svd in (False, True):
+        kernels = classical_kernels.kernels(wp.float64, builtin_svd=builtin_svd)
+        grad, params = torch.zeros_like(F), torch.zeros(1, 2, dtype=torch.float64)
+        kind, row = torch.tensor([classical_kernels.FIXED_COROTATED], dtype=torch.int32), torch.tensor([[2.0, 3.0]], dtype=torch.float64)
+        launch(kernels.stress_adjoint, 4, [F, kind, row, torch.zeros(4, dtype=torch.int32), A, grad, params], F.device)
+        found.append((grad, params))
+    for own, other in zip(*found):
+        torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-11)
