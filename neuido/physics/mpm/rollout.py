@@ -11,16 +11,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuido.errors import UserError
 from neuido.physics.colliders.attachments import AttachmentLoop
 from neuido.physics.colliders.solid_loop import SolidLoop, SolidTape, new_solid_tape
 from neuido.physics.effects import swelling_kernels
 from neuido.physics.effects.spin_decay import SpinDecay
 from neuido.physics.laws.base import Engine
-from neuido.physics.mpm.kernels import transfers as kernels
 from neuido.physics.mpm.plan import BODY_FRICTION, SHRINKAGE, SPIN_LOSS, STATES, Material, Plan, at_step, attachment_loop, solid_loop
 from neuido.physics.runtime.device import real_of, torch_stream
-from neuido.physics.runtime.invalidation import invalidate
 from neuido.physics.runtime.launches import LaunchRecordings
 
 
@@ -428,35 +425,3 @@ def grid_inputs(plan: Plan, pull: Tensor, force: Tensor, friction: Tensor, reach
         setup.room.near[reach],
         setup.room.chunk,
     ]
-
-
-def check(plan: Plan, tape: Tape) -> None:
-    """Note the events of a run, and raise the earliest failure that the kernels reported, or that the last frame is not finite.
-
-    With `nan_on_failure` the frames of failed scenes are set to NaN instead.
-
-    Raises:
-        UserError: A particle lost, too fast, or not finite.
-    """
-    setup, found = plan.setup, tape.status.view(-1, 3)
-    plan.recorder.add(tape.lowest, tape.since, setup.first_particle, plan.offset)
-    finite = torch.isfinite(tape.F[-1]).all(dim=(1, 2))
-    if bool(finite.all() & ~found.any()):  # one transfer
-        return
-    if plan.nan_on_failure:
-        invalidate(tape.states[:4], ~finite | (found[:, 0] != 0)[setup.field.long()], setup.particles.scene)
-        return
-    # report the earliest failure
-    code, p, step = min((row for row in found.tolist() if row[0]), key=lambda row: row[2], default=(0, 0, 0))
-    if code == 0:
-        p, step = int((~finite).nonzero()[0]), plan.steps - 1
-    s = int(setup.particles.scene[p])
-    p = int(setup.order[p]) + setup.first_particle
-    scene = setup.scenes[s]
-    s += setup.first_scene
-    what = {
-        kernels.LOST: "left the domain; enlarge `lower`/`upper`, close it with `walls`, or set `on_leave` to clamp or delete",
-        kernels.FAST: f"moved by more than a cell ({scene.dx:.4g} m) or became NaN; lower `dt` (now {scene.dt:g} s) or the stiffness",
-        0: f"has a deformation gradient that is not finite; lower `dt` (now {scene.dt:g} s) or check the law",
-    }[code]
-    raise UserError(f"particle {p} of scene {s} {what} (substep {plan.offset + step + 1} of {plan.total})")
