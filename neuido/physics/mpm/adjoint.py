@@ -72,8 +72,9 @@ def run_backward(
         for engine, own in ((elastic, wanted[FIXED : plan.split]), (plastic, wanted[plan.split :])):
             if engine is not None:
                 engine.start_adjoint(own)
-                name = "elastic" if engine is elastic else "plastic"
-                engine.grads = [None if g is None else tape.scratch(f"{name} {i}", g).zero_() for i, g in enumerate(engine.grads)]
+                if hasattr(engine, "grads"):  # an engine of several laws has none of its own
+                    name = "elastic" if engine is elastic else "plastic"
+                    engine.grads = [None if g is None else tape.scratch(f"{name} {i}", g).zero_() for i, g in enumerate(engine.grads)]
         spin = plan.spin_decay(inputs)
         damped = None if spin is None else (torch.empty_like(now[1]), torch.empty_like(now[2]))
         solids = solid_loop(plan, inputs, tape.solids)
