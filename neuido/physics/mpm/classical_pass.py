@@ -26,6 +26,8 @@ def build(real: type, corrects: bool, turns: int) -> SimpleNamespace:
     start_warp()
     name = f"neuido.substep.{real.__name__}.{'corrected' if corrects else 'elastic'}.{turns}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
     func = functools.partial(wp.func, module=name)
     law, move = classical_kernels.kernels(real).functions, particle_functions.functions(real, name, turns)
     stress_of, stress_gradient, correct, correction_gradient, warp_sum = law
@@ -99,7 +101,7 @@ def build(real: type, corrects: bool, turns: int) -> SimpleNamespace:
             watch(p, s, y, v, before, hold, origin, dx, dt, nodes, step, status, lowest, since)
         scatter(y, v, C, stress, mass[p], volume[p], s, origin, dx, dt, nodes, grid, live)
 
-    @kernel
+    @adjoint_kernel
     def retreat(
         scenes: ints, firsts: ints, lasts: ints, held: wp.array(dtype=wp.uint8), origin: vectors, dx: reals, dt: reals, nodes: wp.vec3i,
         mass: reals, volume: reals, x_before: vectors, F_before: matrices, trial: matrices, velocity: quads,

@@ -27,8 +27,7 @@ def build(width: int, kind: str, corrects: str | None, turns: int, per_warp: int
     """
     start_warp()
     name = f"neuido.substep.{width}.{kind}.{corrects or 'elastic'}.{turns}.{per_warp}"
-    wp.set_module_options({"fast_math": True}, module=wp.get_module(name))  # as in `fused`
-    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    kernel, adjoint_kernel = fused.kernels_of(name)
     func = functools.partial(wp.func, module=name)
     own, layers = fused.readout(kind, name), fused.networks(width, name, per_warp)
     move = particle_functions.functions(wp.float32, name, turns)
@@ -141,7 +140,7 @@ def build(width: int, kind: str, corrects: str | None, turns: int, per_warp: int
                 tau[p] = stress
         scatter(y, v, C, stress, mass[p], volume[p], s, origin, dx, dt, nodes, grid, live)
 
-    @kernel
+    @adjoint_kernel
     def retreat(
         scenes: ints, firsts: ints, lasts: ints, held: wp.array(dtype=wp.uint8), origin: vectors, dx: floats, dt: floats, nodes: wp.vec3i,
         mass: floats, volume: floats, x_before: vectors, F_before: matrices, trial: matrices, velocity: quads,

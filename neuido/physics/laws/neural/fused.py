@@ -10,7 +10,7 @@ next layer: activations never leave the registers. `networks.py` is the implemen
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import torch
@@ -105,6 +105,17 @@ def networks(width: int, name: str, per_warp: int = 32) -> SimpleNamespace:
     return SimpleNamespace(network=network, network_adjoint=network_adjoint, outputs=outputs, vecK=vecK)
 
 
+def kernels_of(name: str) -> list[Callable]:
+    """Return the decorators of kernels and of their adjoints, which a run without gradients does not compile.
+
+    Both approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions.
+    """
+    modules = name, f"{name}.backward"
+    for module in modules:
+        wp.set_module_options({"fast_math": True}, module=wp.get_module(module))
+    return [functools.partial(wp.kernel, module=module, enable_backward=False) for module in modules]
+
+
 @cached
 def build(width: int, kind: str, per_warp: int = 32) -> SimpleNamespace:
     """Return the fused kernels for one hidden width, one of `WIDTHS`, and one read-out: `STRESS`, `BOUNDED`, `CORRECTION` or `RETURN`.
@@ -113,14 +124,12 @@ def build(width: int, kind: str, per_warp: int = 32) -> SimpleNamespace:
     """
     start_warp()
     name = f"neuido.fused.{width}.{kind}.{per_warp}"
-    # approximate logarithms, roots and divisions: relative error 1e-6 with a third of the instructions
-    wp.set_module_options({"fast_math": True}, module=wp.get_module(name))
     own, layers = readout(kind, name), networks(width, name, per_warp)
     vec4, vec9, mat33 = own.vec4, own.vec9, own.mat33
     strain_invariants, features_of = own.strain_invariants, own.features_of
     value, coefficients, gradient = own.value, own.coefficients, own.gradient
     network, network_adjoint, outputs = layers.network, layers.network_adjoint, layers.outputs
-    kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    kernel, adjoint_kernel = kernels_of(name)
     floats = wp.array(dtype=wp.float32)
     ints = wp.array(dtype=wp.int32)
 
@@ -139,7 +148,7 @@ def build(width: int, kind: str, per_warp: int = 32) -> SimpleNamespace:
         if p < lasts[warp]:
             out[p] = value(Fp, l, A, q, outputs(k), scale)
 
-    @kernel
+    @adjoint_kernel
     def adjoint(
         F: wp.array(dtype=mat33), scenes: ints, firsts: ints, lasts: ints, shared: int, rows: int,
         W1: floats, W2: floats, B2: floats, W3: floats, B3: floats, scale: float, W2T: floats, W3T: floats, W1T: floats,

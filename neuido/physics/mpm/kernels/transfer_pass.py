@@ -16,6 +16,8 @@ def build(real: type, turns: int) -> SimpleNamespace:
     start_warp()
     name = f"neuido.substep.{real.__name__}.transfers.{turns}"
     kernel = functools.partial(wp.kernel, module=name, enable_backward=False)
+    # a module of their own: a run without gradients never compiles them
+    adjoint_kernel = functools.partial(wp.kernel, module=f"{name}.backward", enable_backward=False)
     move = particle_functions.functions(real, name, turns)
     gather, watch, scatter = move.gather, move.watch, move.scatter
     gather_adjoint, scatter_adjoint = move.gather_adjoint, move.scatter_adjoint
@@ -56,7 +58,7 @@ def build(real: type, turns: int) -> SimpleNamespace:
             p = lasts[warp] - 1
         scatter(x[p], v[p], C[p], tau[p], mass[p], volume[p], scenes[warp], origin, dx, dt, nodes, grid, live)
 
-    @kernel
+    @adjoint_kernel
     def push_adjoint(
         scenes: ints, firsts: ints, lasts: ints, held: held_type, origin: vectors, dx: reals, dt: reals, nodes: wp.vec3i,
         mass: reals, volume: reals, x: vectors, v: vectors, C: matrices, tau: matrices, a_grid: quads,
@@ -75,7 +77,7 @@ def build(real: type, turns: int) -> SimpleNamespace:
             if a_mass:
                 a_mass[p] = a_mass[p] + bm
 
-    @kernel
+    @adjoint_kernel
     def pull_adjoint(
         scenes: ints, firsts: ints, lasts: ints, held: held_type, origin: vectors, dx: reals, dt: reals, nodes: wp.vec3i,
         mass: reals, volume: reals, velocity: quads, x: vectors, F: matrices, v_next: vectors, C_next: matrices,
