@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from neuido.data.files.writing import make_real_folder, remove, write_bytes
-from neuido.discrepancy.problems.problem import Ask, Point, Problem, Recording, Rows
+from neuido.discrepancy.problems.problem import Ask, Parameter, Point, Problem, Recording, Rows
 from neuido.errors import shortened
 from neuido.installation import __version__
 
@@ -181,6 +181,15 @@ class CachedProblem(Problem):
 
     def refusal(self, setting: int) -> str:
         return self.problem.refusal(setting)
+
+    def bears(self, point: Point, setting: int) -> bool:
+        return self.problem.bears(point, setting)
+
+    def shown(self, point: Point, p: Parameter) -> tuple[float, float]:
+        return self.problem.shown(point, p)
+
+    def instrument_errors(self, point: Point, recording: int) -> np.ndarray:
+        return self.problem.instrument_errors(point, recording)
 
     def effort(self, recording: int, setting: int = 0) -> float:
         return self.problem.effort(recording, setting)

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from neuido.discrepancy.inference.least_squares import Race, levenberg_marquardt, run
+from neuido.discrepancy.problems.planes.plane_problem import PlaneProblem
 from neuido.discrepancy.problems.problem import Parameter, Problem, Recording
+from neuido.discrepancy.problems.rollouts import BodyRollouts
+from neuido.discrepancy.problems.specimens.material import MaterialProblem
+from neuido.discrepancy.problems.tracks.track_problem import TrackProblem
 from neuido.discrepancy.store import CachedProblem, Memo
 
 T = np.linspace(0.0, 1.0, 40)
@@ -184,3 +188,10 @@ def test_a_fit_that_cannot_catch_up_stops_and_the_others_do_not():
     assert Race(1.0).lost([1e6, 1e5, 1e4], 9)  # no fit keeps this pace up
     assert not Race(1.0).lost([100.0, 90.0], 10)  # one iteration says little
     assert not Race().lost([100.0, 99.0, 98.0], 9)  # nobody is ahead
+
+
+def test_the_store_passes_on_whatever_a_problem_answers():
+    """`shown` and the errors of the instruments had been those of a problem without any, in every run of the command line."""
+    kinds = (TrackProblem, MaterialProblem, PlaneProblem, BodyRollouts)
+    asked = {name for kind in kinds for name in vars(kind) if not name.startswith("_") and name in vars(Problem)}
+    assert {"shown", "instrument_errors", "noise_with"} <= asked <= set(vars(CachedProblem))
