@@ -12,7 +12,7 @@ from neuido.discrepancy.inference.floors import Floor, Stand
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search.judging import IMPLAUSIBLE
-from neuido.discrepancy.problems.problem import Parameter
+from neuido.discrepancy.problems.problem import Parameter, Point
 
 QUANTILE = 0.95
 """Probability below the upper end of a 90 % interval."""
@@ -20,6 +20,16 @@ NORMAL = float(norm.ppf(QUANTILE))
 ROOM = 4.0
 """Largest factor by which a residual above the noise may scale the estimated discretisation error of an interval, a ratio of mean
 squares."""
+HALF_TURN = math.pi
+"""Angle after which a direction of an axis repeats itself."""
+FIRST_STEP = 0.125
+"""Half of the first step of a profile, in typical steps of the parameter; each further one is twice as long."""
+TRIES = 14
+"""Refits of each end of a profile at the most: ten doublings reach a hundred typical steps, and four more halve what is left."""
+PROFILED = 6
+"""Number of fitted parameters up to which all intervals are profiled where one linear interval fails; with more it would take too long."""
+CLOSE = 0.03
+"""Relative error of the root of the rise at which the end of a profile is found."""
 NEARBY = 0.02
 """Sum of squares of the amounts of the other settings up to which the data are taken to lie on the setting in use."""
 
@@ -33,7 +43,9 @@ def intervals(lab: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> di
     relative to what the refits leave, or by the distance of the data from the setting in use where that is more. Held-out parts count here,
     because a fit may hide the error of the solver in its parameters.
 
-    A parameter without influence on the data gets its whole range.
+    Where nothing is discretised and an interval would leave the range of its parameter, the linear model has failed: at an angle where the
+    prediction is stationary, or beside a size of zero, slopes say nothing. The intervals are found by refits then (`profiled`), those of
+    all parameters if there are at most `PROFILED`. Elsewhere a parameter without influence on the data gets its whole range.
 
     Args:
         lab: The method that predicts.
@@ -51,12 +63,102 @@ def intervals(lab: Laboratory, fit: Fit, floor: Floor, errors: np.ndarray) -> di
             room = max(_room(above, np.mean([squares for _, squares in refits], axis=0)), min(away, ROOM))
             shifts = np.array([[p.coordinate(f.point[p.name]) - p.coordinate(fit.point[p.name]) for p in parameters] for f, _ in refits])
             variances = variances + room * _widened(len(shifts)) ** 2 * np.mean(shifts**2, axis=0)
-    out = {}
+    out, failed = {}, []
     for parameter, deviation in zip(parameters, np.sqrt(variances), strict=True):
         q, half = parameter.coordinate(fit.point[parameter.name]), NORMAL * deviation
         ends = (parameter.lower, parameter.upper)
         out[parameter.name] = (parameter.physical(q - half), parameter.physical(q + half)) if math.isfinite(half) else ends
-    return out
+        low, high = _range(parameter, q)
+        failed += [parameter] if not (low <= q - half and q + half <= high) else []
+    if not failed or lab.problem.settings > 1:
+        return out
+    return out | profiled(lab, fit, floor, parameters if len(parameters) <= PROFILED else failed, failed)
+
+
+class _End:
+    """One end of a profiled interval: the coordinates between which it lies, each with the root of the rise of the misfit."""
+
+    def __init__(self, parameter: Parameter, fit: Fit, side: int) -> None:
+        self.parameter, self.side, self.point = parameter, side, fit.point
+        self.inside, self.outside = (parameter.coordinate(fit.point[parameter.name]), 0.0), (math.nan, math.inf)
+        self.limit = _range(parameter, self.inside[0])[side > 0]
+        self.step = FIRST_STEP
+        self.found = self.inside[0] == self.limit
+
+    def next(self, rise: float) -> float:
+        """Return the coordinate to try next: twice as far as before, or by interpolation where the end is enclosed."""
+        (q, root), (beyond, above) = self.inside, self.outside
+        if math.isinf(above):
+            self.step *= 2.0
+            return min(q + self.step, self.limit) if self.side > 0 else max(q - self.step, self.limit)
+        return q + (beyond - q) * float(np.clip((rise - root) / (above - root), 0.1, 0.9))
+
+    def take(self, q: float, fit: Fit, root: float, rise: float) -> None:
+        """Note the root of the rise of the misfit at a coordinate."""
+        near = abs(root - rise) < CLOSE * rise
+        if root <= rise or near:
+            self.inside, self.point = (q, root), fit.point
+        else:
+            self.outside = (q, root)
+        self.found = near or self.inside[0] == self.limit
+
+
+def profiled(
+    lab: Laboratory, fit: Fit, floor: Floor, parameters: Sequence[Parameter], still: Sequence[Parameter] = ()
+) -> dict[str, tuple[float, float]]:
+    """Return 90 % intervals by the profile of the misfit: the values with which a refit of the others leaves as little as chance allows.
+
+    The unit of the misfit is what the fit leaves for each datum, as to first order. Directions are looked for within a quarter of a turn on
+    either side, which is every direction of an axis.
+
+    Args:
+        lab: The method that predicts.
+        fit: The fit.
+        floor: Noise and discretisation at its end.
+        parameters: Parameters whose intervals are wanted.
+        still: Parameters whose slopes may be zero at the fit, where a refit of them would stay: refits also begin a typical step away.
+    """
+    others = {p.name: [lab.problem.parameter(name) for name in fit.names if name != p.name] for p in parameters}
+    white = floor.whitener(lab.parts)
+    left = np.concatenate([white(lab.residual(fit.point, n), n) for n in lab.fitted_recordings])
+    rise = NORMAL * float(np.sqrt(np.mean(left**2)))
+    every = [lab.problem.parameter(name) for name in fit.names]
+    anew = lab.fits([lab.request(every, start, until=math.inf) for start in (fit.point, *(_moved(fit.point, p) for p in still))], floor)
+    least = min(lab.costs([fit.point, *(one.point for one in anew)], floor))
+    ends = [_End(p, fit, side) for p in parameters for side in (-1, 1)]
+    for _ in range(TRIES):
+        open_ends = [end for end in ends if not end.found]
+        if not open_ends:
+            break
+        tried = [end.next(rise) for end in open_ends]
+        begun = [
+            (i, {**start, end.parameter.name: end.parameter.physical(q)})
+            for i, (end, q) in enumerate(zip(open_ends, tried, strict=True))
+            for start in (end.point, *(_moved(end.point, p) for p in still if p is not end.parameter))
+        ]
+        requests = [
+            lab.request(others[open_ends[i].parameter.name], start, until=math.inf, iterations=8, tolerance=discretisation.ROUGH)
+            for i, start in begun
+        ]
+        fits = lab.fits(requests, floor, step="intervals")
+        for i, (end, q) in enumerate(zip(open_ends, tried, strict=True)):
+            found = min((one for (j, _), one in zip(begun, fits, strict=True) if j == i), key=lambda one: one.cost)
+            end.take(q, found, math.sqrt(max(found.cost - least, 0.0)), rise)
+    values = {(end.parameter.name, end.side): end.parameter.physical(end.inside[0]) for end in ends}
+    return {p.name: (values[p.name, -1], values[p.name, 1]) for p in parameters}
+
+
+def _moved(point: Point, p: Parameter) -> Point:
+    """Return a point with one parameter a typical step further, or back where that would leave its range."""
+    there = p.physical(p.coordinate(point[p.name]) + 1.0)
+    return {**point, p.name: there if there != point[p.name] else p.physical(p.coordinate(point[p.name]) - 1.0)}
+
+
+def _range(parameter: Parameter, q: float) -> tuple[float, float]:
+    """Return the coordinates between which an interval about q may lie: the range, or of a direction half a turn."""
+    low, high = (parameter.coordinate(v) if v > 0 or not parameter.log else -math.inf for v in (parameter.lower, parameter.upper))
+    turn = HALF_TURN / parameter.scale if parameter.unit == "rad" else math.inf
+    return max(low, q - 0.5 * turn), min(high, q + 0.5 * turn)
 
 
 def _room(above: np.ndarray, error: np.ndarray) -> float:
