@@ -94,7 +94,8 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
         content["doubts"] = doubtful
     if "unseen" in d.problem.labels:
         content["unseen"] = d.problem.labels["unseen"]
-    if content["effects"] and (scale := rival_scale(d.problem, d.before, d.after)) is not None:
+    size = sum(len(r.chosen.candidate.parameters) for r in d.rounds if r.chosen is not None)
+    if content["effects"] and (scale := rival_scale(d.problem, d.before, d.after, size)) is not None:
         content["scale_error"] = scale
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]

@@ -1,11 +1,14 @@
 """An error of the length scale as a rival of the effects that a track is said to lack."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import neuido
+from neuido.data.measured.track import read_tracks
+from neuido.discrepancy.problems.tracks.track_problem import track_problems
 from tests.discrepancy import made
 
 SAID = "A scale error would explain it as well"
@@ -36,3 +39,21 @@ def test_a_drag_that_no_scale_imitates_does_not(tmp_path):
     found = diagnosed(tmp_path / "balls", drag=0.12, scale=1.0, effects=["gravity", "drag_quadratic"])
     assert [e["name"] for e in found["effects"]] == ["drag_quadratic"]
     assert "scale_error" not in found and not any(SAID in line for line in found["words"])
+
+
+def test_a_ruler_is_not_off_by_a_sixth(tmp_path):
+    """The prior of a calibration counts: no ruler explains 16 %."""
+    found = diagnosed(tmp_path / "balls", drag=0.0, scale=1.16, effects=["gravity", "drag_quadratic"])
+    assert [e["name"] for e in found["effects"]] == ["gravity"]
+    assert "scale_error" not in found
+
+
+@pytest.mark.parametrize(("factor", "said"), [(100.0, "100 times longer"), (0.01, "100 times shorter"), (8.0, "")])
+def test_a_recording_in_another_unit_is_told(tmp_path, factor, said):
+    made.track(tmp_path / "balls", drag=0.0)
+    tracks = read_tracks(tmp_path / "balls")
+    first = tracks.recordings[0]
+    odd = replace(first, name="odd", x=factor * first.x, role="held_out")
+    (problem,) = track_problems(replace(tracks, recordings=(*tracks.recordings, replace(first, name="again"), odd)))
+    words = problem.labels.get("unseen", "")
+    assert (f"The path of odd is {said}" in words) if said else "path of" not in words

@@ -1,36 +1,57 @@
-"""Whether an error of the length scale would explain a track as well as the effects that were named."""
+"""Doubts about the length scale: an error of it as a rival of what was named, and recordings of another scale than the others."""
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from neuido.data.measured.track import Track
 from neuido.discrepancy.problems.problem import Point, Problem
 
-WIDE = 0.1
-"""Standard deviation of the length scale with which the model without effects is fitted again: far wider than any calibration."""
-AS_WELL = 1.05
-"""Ratio of two errors up to which one model fits as well as the other; the words compare rivals from the same ratio on."""
+CALIBRATION = 0.05
+"""Standard deviation of a length scale of which nothing better is known: of a ruler that stands a twentieth of the camera's distance before
+or behind the motion."""
+OTHER_SCALE = 10.0**1.5
+"""Ratio of a path to those of the other recordings from which another unit is suspected. It lies nearer to a hundred, a metre for a
+centimetre, than to ten, which launches of one experiment differ by."""
 
 
-def rival_scale(problem: Problem, before: Point, after: Point) -> list[float] | None:
-    """Return the smallest and the largest error of the length scale by which the model without effects fits as well as with them.
+def rival_scale(problem: Problem, before: Point, after: Point, count: int) -> list[float] | None:
+    """Return the smallest and the largest error of the length scale by which the model without effects explains as much as with them.
 
-    There is one for each fitted recording, and all must be of one sign. None: the data are no lengths of a track, or the effects leave
-    less.
+    The scale of each fitted recording has a Gaussian prior, of `CALIBRATION` or what the folder states if that is more. It explains as much
+    if Schwarz's criterion does not prefer the effects: misfit and prior together exceed those with the effects by no more than log n for
+    each of their parameters, n data. Where the effects leave more than the noise, their misfit sets the unit (Birge's ratio).
 
     Args:
         problem: What was diagnosed.
         before: The fit without effects.
         after: The fit with the named effects.
+        count: Number of fitted parameters of the named effects.
+
+    Returns:
+        The errors; None if the data are no lengths of a track, if the effects explain more, or if the scales that it takes differ in sign.
     """
     if not hasattr(problem, "with_scale_error") or problem.unit != "m":
         return None
-    other = problem.with_scale_error(WIDE)
-    fitted = problem.roles["fit"]
-    left, by_scale = (sum(_squares(one, point, n) for n in fitted) for one, point in ((problem, after), (other, before)))
-    if not by_scale < AS_WELL**2 * left:
+    other, fitted = problem.with_scale_error(CALIBRATION), problem.roles["fit"]
+    data = sum(len(problem.recordings[n].y) for n in fitted)
+    left, by_scale = (sum(one.misfit(point, n) for n in fitted) for one, point in ((problem, after), (other, before)))
+    if not by_scale - left <= count * math.log(data) * max(left / data, 1.0):
         return None
     found = [other.nuisances_of(before, n)[f"length_scale:{problem.recordings[n].name}"] for n in fitted]
     return [min(found, key=abs), max(found, key=abs)] if min(found) > 0 or max(found) < 0 else None
 
 
-def _squares(problem: Problem, point: Point, recording: int) -> float:
-    return float(np.sum((problem.predict([point], recording)[0] - problem.recordings[recording].y) ** 2))
+def of_another_scale(tracks: Sequence[Track]) -> list[tuple[Track, float]]:
+    """Return the recordings whose path is much longer or shorter than those of the others, with the ratio to their median."""
+    lengths = [float(np.linalg.norm(np.ptp(track.x, axis=0))) for track in tracks]
+    out = []
+    for i, (track, own) in enumerate(zip(tracks, lengths, strict=True)):
+        others = [length for length in lengths[:i] + lengths[i + 1 :] if length > 0]
+        if len(others) < 2 or own == 0:  # of two, neither is the other's measure
+            continue
+        ratio = own / float(np.median(others))
+        if max(ratio, 1 / ratio) > OTHER_SCALE:
+            out.append((track, ratio))
+    return out

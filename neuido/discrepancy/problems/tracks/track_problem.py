@@ -15,6 +15,7 @@ from neuido.discrepancy.problems.noise import SeriesError, correlation, high_pas
 from neuido.discrepancy.problems.problem import Point, Problem, Recording
 from neuido.discrepancy.problems.tracks.guides import guide_of, normal_of
 from neuido.discrepancy.problems.tracks.released import Released, scale_gradient, settle, settled_error
+from neuido.discrepancy.problems.tracks.scale_error import of_another_scale
 from neuido.discrepancy.problems.tracks.track_candidates import declared_parameter, ordinary_sizes, track_candidates
 from neuido.physics.effects.library import KNOTS
 from neuido.physics.points.point_mass import Forces
@@ -69,7 +70,7 @@ class TrackProblem(Problem):
             nuisances=(),
             candidates=candidates,
             recordings=tuple(map(self._recording, self._flights, self._starts)),
-            labels={"kind": "track", "body": body, "ordinary": ordinary_sizes(tracks, body)} | _said(lost, self._flights),
+            labels={"kind": "track", "body": body, "ordinary": ordinary_sizes(tracks, body)} | _said(lost, self._flights, tracks),
         )
 
     def _released(self, track: Track, effects: set[str]) -> Released:
@@ -127,8 +128,9 @@ class TrackProblem(Problem):
         return scale_gradient(start, self.forces([point], track)).reshape(-1, 1)
 
     def with_scale_error(self, sd: float) -> "TrackProblem":
-        """Return this problem with another standard deviation of the length scale; noise and candidates stay as they are."""
+        """Return this problem with a length scale of at least this standard deviation; noise and candidates stay as they are."""
         other = copy.copy(self)
+        sd = max(sd, self.tracks.nuisances["length_scale"])
         other.tracks = replace(self.tracks, nuisances={**self.tracks.nuisances, "length_scale": sd})
         other._starts = [other._released(track, {c.name for c in self.candidates}) for track in self._flights]
         return other
@@ -145,6 +147,17 @@ class TrackProblem(Problem):
         early = _early(track) if track.role == "held_out" else 0
         values = settle(start, forces, len(points), early or len(track.t))
         return start.seen(values, forces, track.t)[:, early:], values
+
+    def misfit(self, point: Point, recording: int) -> float:
+        """Return the sum of squares of what a fitted recording leaves, in units of the noise and of the priors of its nuisances."""
+        return float(np.sum(self._left([point], recording) ** 2))
+
+    def _left(self, points: Sequence[Point], recording: int) -> np.ndarray:
+        """Return the whitened residuals of a fitted recording and its nuisances in units of their priors, (P, m)."""
+        seen, values = self._profile(points, recording)
+        start = self._starts[recording]
+        r = start.whiten(seen - self._flights[recording].x).reshape(len(points), -1)
+        return np.concatenate([r, start.off_prior(values)], axis=1)
 
     def nuisances_of(self, point: Point, recording: int) -> dict[str, float]:
         """Return the nuisances that `predict` fits to a recording for one parameter set, by name."""
@@ -254,10 +267,7 @@ class TrackProblem(Problem):
                 asked += [shape | {name: step} for name, step in own]
         columns, left = [], []
         for n in self.roles["fit"] if spans else ():
-            seen, values = self._profile(asked, n)
-            start = self._starts[n]
-            r = start.whiten(seen - self._flights[n].x).reshape(len(asked), -1)
-            r = np.concatenate([r, start.off_prior(values)], axis=1)
+            r = self._left(asked, n)
             columns.append((r[1:] - r[0]).T)
             left.append(r[0])
         out: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -376,10 +386,15 @@ def without_strays(tracks: Tracks) -> tuple[Tracks, dict[str, int]]:
     return replace(tracks, recordings=tuple(kept)), lost
 
 
-def _said(lost: dict[str, int], flights: Sequence[Track]) -> dict[str, str]:
-    """Return the label that tells how many frames of a body's recordings were left out; none where none was."""
+def _said(lost: dict[str, int], flights: Sequence[Track], tracks: Tracks) -> dict[str, str]:
+    """Return the label that tells which frames of a body were left out, and which recordings have another scale; none if there is none."""
     own = [f"{lost[track.name]} of {track.name}" for track in flights if lost[track.name]]
-    return {"unseen": f"Frames far from those before and after were left out: {', '.join(own)}."} if own else {}
+    said = [f"Frames far from those before and after were left out: {', '.join(own)}."] if own else []
+    for track, ratio in of_another_scale([track for track in tracks.recordings if track.angle == flights[0].angle]):
+        if track.body == flights[0].body:
+            times, word = max(ratio, 1 / ratio), "longer" if ratio > 1 else "shorter"
+            said.append(f"The path of {track.name} is {times:.0f} times {word} than those of the other recordings: is it in the same unit?")
+    return {"unseen": " ".join(said)} if said else {}
 
 
 def flight_of(track: Track, tracks: Tracks) -> Track:
