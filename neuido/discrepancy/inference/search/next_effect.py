@@ -22,8 +22,8 @@ from neuido.discrepancy.inference.search import contests, judging, prospects, re
 from neuido.discrepancy.inference.search.contests import MANY, better
 from neuido.discrepancy.inference.search.judging import ABOVE, ALPHA, LED_AWAY, WITHIN
 from neuido.discrepancy.inference.search.refining import MEASURED, NEAR
-from neuido.discrepancy.inference.search.search_state import Look, Search
-from neuido.discrepancy.problems.problem import Candidate, Problem
+from neuido.discrepancy.inference.search.search_state import Look, Search, Start
+from neuido.discrepancy.problems.problem import Candidate, Parameter, Problem
 
 CONFIRMED = 0.8
 """Share of the search's work at which first fits end, for a method that is asked after another one named an effect. The rest is for a
@@ -104,6 +104,10 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
             grown = list(refining.growing(search, base, floor, candidates).values())
         best |= refining.refit_at_own_floors(lab, grown, best, floor)
         result = judged(empty)
+    if leaves_more(lab, result) and not lab.budget.skips("fits of the effects that were left out or given up"):
+        best |= fits_of_the_rest(lab, free, [c for c in candidates if c.key not in best], base, slopes, floor)
+        best |= continued(lab, free, best, floor)
+        result = judged(empty)
     plain = without_effect(lab, result, base, floor)
     if plain is not None:
         if not found:
@@ -112,6 +116,35 @@ def find(search: Search, base: Fit, floor: Floor, found: Sequence[Trial], rival:
     if not found:
         search.asked = result
     return result
+
+
+def leaves_more(lab: Laboratory, r: Round) -> bool:
+    """Return whether the best effect of a round leaves so much where nothing is discretised that no effect may go without a fit.
+
+    "Something more that no effect explains" is then about to be said, and the directions of a screening far from the truth are no proof.
+    """
+    left = min([times_over(t.errors, r.floors) for t in r.trials] or [r.over])
+    return lab.problem.settings == 1 and left > unexplained(lab)
+
+
+def fits_of_the_rest(
+    lab: Laboratory, free: Sequence[Parameter], rest: Sequence[Candidate], base: Fit, slopes: Mapping[int, np.ndarray], floor: Floor
+) -> dict[str, tuple[Candidate, Fit]]:
+    """Fit candidates from their own starts and the best of larger sizes; return the best fit of each by key."""
+    starts: list[Start] = [(c, {**base.point, **start}, None) for c in rest for start in c.starts]
+    if not starts:
+        return {}
+    lab.tell(f"fitting {', '.join(c.key for c in rest)}")
+    return contests.contest(lab, free, contests.sized(lab, starts, base, slopes, floor)[0], floor).best
+
+
+def continued(
+    lab: Laboratory, free: Sequence[Parameter], best: Mapping[str, tuple[Candidate, Fit]], floor: Floor
+) -> dict[str, tuple[Candidate, Fit]]:
+    """Continue the fits that were given up because others led, each alone; return those that end lower, by key."""
+    given_up = [(c, fit) for c, fit in best.values() if not fit.converged and np.isfinite(fit.cost)]
+    ends = lab.fits([lab.request((*free, *c.parameters), fit.point) for c, fit in given_up], floor)
+    return better(((c, end) for (c, _), end in zip(given_up, ends, strict=True)), best)
 
 
 def without_effect(lab: Laboratory, result: Round, base: Fit, floor: Floor) -> Stand | None:
