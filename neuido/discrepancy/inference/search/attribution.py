@@ -366,7 +366,8 @@ def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], ro
     missing = bool(found) or first.unsure or next_effect.is_unexplained(lab, first)
     if missing and not cut and not wrong:
         discretisation.floor_at(lab, after.fit.point, like=after.floor)  # records which settings run there
-    facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(lab), "found": [t.candidate.key for t in found]}
+    facts = {"cut": cut, "wrong": wrong, "blind": missing and blind_to_settings(lab), "found": [t.candidate.key for t in found],
+             "scatter": problem.labels.get("scatter", False)}  # fmt: skip
     answer, why = decided(lab, before.errors, found, steps, cut=cut, wrong=wrong, blind=facts["blind"])
     case = case_of(lab, before, after, rounds, answer, why, facts)
     if found and answer not in ("effect", "class"):  # no effect is named, so none is added

@@ -157,7 +157,8 @@ def stored_problem(case: CaseRecord) -> Problem:
         for name, role, count, noise, origin in case.recordings
     )
     settings = 2 if case.discretised else 1
-    return Problem(case.name, "", "", declared, (), tuple(map(candidate_from_dict, case.candidates)), recordings, settings)
+    candidates, labels = tuple(map(candidate_from_dict, case.candidates)), {"scatter": case.facts.get("scatter", False)}
+    return Problem(case.name, "", "", declared, (), candidates, recordings, settings, labels=labels)
 
 
 def stand_of(lab: Laboratory, record: FitRecord) -> Stand:

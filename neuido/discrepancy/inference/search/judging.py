@@ -269,10 +269,12 @@ def by_chance(lab: Laboratory, r: Round) -> float:
 def as_good(search: Search, t: Trial, top: Trial) -> bool:
     """Return whether a fit has about the error of the best one.
 
-    With `FEW` or more parameters more than the best one, it must have a smaller error, by `PARSIMONY` for each.
+    With `FEW` or more parameters more than the best one, it must have a smaller error, by `PARSIMONY` for each. Where the floor is the
+    scatter of specimens, this does not hold: a specimen is off as a whole, and its many rows are no evidence for fewer parameters.
     """
     lab = search.lab
-    more = len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
+    scattered = lab.problem.labels.get("scatter", False)
+    more = 0 if scattered else len(t.candidate.size_parameters) - len(top.candidate.size_parameters)
     ratio = CLASS_RATIO if lab.problem.settings == 1 or comparing.is_noise(lab, top.errors) else CLASS_RATIO_ABOVE
     if is_exact(search, top):
         ratio = CLASS_RATIO_EXACT

@@ -51,6 +51,8 @@ class MaterialProblem(Problem):
         noises = [_noise_in(tests, next(chain for chain in chains if i in chain), i, repeated) for i in range(len(tests.tests))]
         candidates, fixed, excluded = material_candidates(tests)
         unit = tests.tests[0].unit
+        labels: dict[str, Any] = {"kind": "material test"} | ({"excluded": excluded} if excluded else {})
+        labels |= {"scatter": _is_scatter(tests, repeated)} if repeated else {"unseen": UNREPEATED}
         super().__init__(
             name=tests.name,
             measure="rmse",
@@ -59,7 +61,7 @@ class MaterialProblem(Problem):
             nuisances=(),
             candidates=candidates,
             recordings=tuple(_recording(test, noise) for test, noise in zip(tests.tests, noises, strict=True)),
-            labels={"kind": "material test"} | ({"excluded": excluded} if excluded else {}) | ({} if repeated else {"unseen": UNREPEATED}),
+            labels=labels,
         )
         self.tests = tests
         self._chains = chains
@@ -145,9 +147,16 @@ class MaterialProblem(Problem):
         return Specimen(elasticity, plasticity, Effects.of(self._effects(points)), len(points), self.tests.incompressible)
 
     def shown(self, point: Point, p: Parameter) -> tuple[float, float]:
-        """Return Young's modulus of a slow and of a fast test: what relaxes stiffens the law at once."""
+        """Return Young's modulus of a slow and of a fast test, or the viscosities at the least and the most viscous rate.
+
+        What relaxes stiffens the law at once, and a fluid that thins has its own viscosity at rest alone.
+        """
         slow, fast = super().shown(point, p)
-        if p.name != "young" or self.tests.fluid:
+        if self.tests.fluid and p.name == "viscosity":
+            rates = ((n, test.path[:, 0]) for n, test in enumerate(self.tests.tests) if test.role == "fit")
+            seen = np.concatenate([np.exp(self.predict([point], n)[0]) / rate for n, rate in rates])
+            return float(seen.min()), float(seen.max())
+        if p.name != "young":
             return slow, fast
         law = self._specimen([point]).law()
         if law.tables.branches is None:
@@ -195,3 +204,9 @@ def _noise_in(tests: MaterialTests, chain: Sequence[int], i: int, repeated: dict
     if tests.tests[i].noise is not None or i not in repeated:
         return found
     return max(found or 0.0, repeated[i])
+
+
+def _is_scatter(tests: MaterialTests, repeated: dict[int, float]) -> bool:
+    """Return whether specimens differ by more than the rows of each fitted test scatter, so that its errors are not independent."""
+    fits = [i for i, test in enumerate(tests.tests) if test.role == "fit"]
+    return all(tests.tests[i].noise is None and repeated.get(i, 0.0) > (noise_of(tests.tests[i]) or 0.0) for i in fits)

@@ -45,6 +45,7 @@ class _Collection:
     def add(
         self, name: str, starts: Sequence[dict[str, float]], *parameters: tuple, sizes: str = "", linear: bool = True, log: str = "",
         form: str = "", needs: str = "", fixed: dict[str, float] | None = None, beside: Sequence[dict[str, float]] = ({},),
+        saturates: str = "",
     ) -> None:  # fmt: skip
         """Add a candidate.
 
@@ -59,6 +60,7 @@ class _Collection:
             needs: The effect that must be in the model before.
             fixed: Parameters that are not fitted.
             beside: Values of declared parameters that every start is made with.
+            saturates: Parameters with which the effect is complete at their upper bound, so that a fit may end there.
         """
         units = {p.name: p.unit for entry in LIBRARY if entry.name == name for p in entry.parameters}
         fixed = {key: self.tests.effects.get(f"{name}.{key}", value) for key, value in (fixed or {}).items()}
@@ -66,7 +68,8 @@ class _Collection:
         for key, scale, lower, upper in parameters:
             value = self.tests.effects.get(f"{name}.{key}", starts[0][key] if sizes and key not in sizes.split() else 0.0)
             bounds = min(lower, value), max(upper, value)
-            made.append(Parameter(f"{name}.{key}", units[key], value, scale, *bounds, log=key in log.split()))
+            complete = key in saturates.split()
+            made.append(Parameter(f"{name}.{key}", units[key], value, scale, *bounds, log=key in log.split(), saturates=complete))
         points = tuple(
             {f"{name}.{key}": float(value) for key, value in (start | fixed).items()} | dict(more) for more in beside for start in starts
         )
@@ -208,17 +211,17 @@ def _timed(c: _Collection, fits: Sequence[MaterialTest], strains: Sequence[np.nd
     c.add("hysteresis", [{"eta": 0.1}], ("eta", 0.05, 0.0, 1.0))
     if duration > 30 * shortest:
         most = 1e4 if not paths or any(test.control == "stress" for test in paths) else 50.0  # a melt relaxes all but a trace
-        names = [f"g{i}" for i in range(1, 6)]
+        names, every = [f"g{i}" for i in range(1, 6)], "g1 g2 g3 g4 g5"
         fixed = {"first": shortest, "last": duration}
         if paths:
             own = [(g, 0.1, 0.0, most) for g in names]
-            c.add("relaxation_spectrum", [dict.fromkeys(names, 0.1)], *own, sizes=" ".join(names), fixed=fixed)
+            c.add("relaxation_spectrum", [dict.fromkeys(names, 0.1)], *own, sizes=every, fixed=fixed, saturates=every)
         else:  # moduli span decades, and so do the weights
             falls = [dict(zip(names, np.geomspace(high, 1.0, 5), strict=True)) for high in (1.0, 30.0, 1e3)]
             own = [(g, 0.5, 1e-3, most) for g in names]
-            c.add("relaxation_spectrum", falls, *own, sizes=" ".join(names), log=" ".join(names), linear=False, fixed=fixed)
+            c.add("relaxation_spectrum", falls, *own, sizes=every, log=every, linear=False, fixed=fixed, saturates=every)
         c.add("fractional", [{"ratio": 0.3, "exponent": a} for a in (0.15, 0.5)], ("ratio", 0.2, 0.0, most), ("exponent", 0.1, 0.03, 0.95),
-              sizes="ratio", log="exponent", fixed={"time": float(np.sqrt(shortest * duration))})  # fmt: skip
+              sizes="ratio", log="exponent", fixed={"time": float(np.sqrt(shortest * duration))}, saturates="ratio")  # fmt: skip
     if tests.model["plasticity"]["law"] == "identity":
         norm = max(stress * np.sqrt(2 / 3), 1e-6)
         rate = norm / (2 * mu) / duration
