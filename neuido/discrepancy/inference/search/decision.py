@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, times_over
+from neuido.discrepancy.inference.floors import Floor, Part, Round, Stand, Trial, times_over, worst_over
 from neuido.discrepancy.inference.journal import CaseRecord, FitRecord, RoundRecord, candidate_from_dict, place, problem_to_dicts
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
@@ -56,6 +56,9 @@ def decided(
     if not enough(lab):
         return "insufficient", ["there are few data for the figures that are free"]
     noisy = times_over(before, lab.noise_squares)
+    worst = worst_over(before, lab.noise_squares)
+    if lab.problem.settings == 1 and worst > next_effect.UNEXPLAINED_EXACT:
+        return "insufficient", [f"what is left is up to {worst:.1f} times the noise, which is an estimate that may be as far off"]
     if noisy > STANDS_OUT:
         return "insufficient", [f"what is left is {noisy:.0f} times the noise, and the discretisation alone may make as much"]
     return "none", []

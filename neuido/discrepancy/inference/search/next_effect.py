@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import norm
 
 from neuido.discrepancy.inference import bootstrap, comparing, directions, discretisation
-from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, patterns, score, times_over
+from neuido.discrepancy.inference.floors import Floor, Led, Round, Stand, Trial, patterns, score, times_over, worst_over
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.least_squares import Fit
 from neuido.discrepancy.inference.search import contests, judging, prospects, refining, stand_ins
@@ -192,9 +192,13 @@ def is_led_away(lab: Laboratory, base: Fit, r: Round) -> bool:
 
 
 def is_unexplained(lab: Laboratory, r: Round) -> bool:
-    """Return whether the residual of a round's base is so far above its floor that the answer cannot be `none`."""
-    held_out = r.held_out_over(lab.fitted) if lab.problem.settings > 1 else 0.0
-    return r.over > unexplained(lab) or held_out > ABOVE
+    """Return whether the residual of a round's base is so far above its floor that the answer cannot be `none`.
+
+    Where nothing is discretised, that of its worst part counts: what one recording shows is not less there because others do not show it.
+    """
+    if lab.problem.settings == 1:
+        return max(r.over, worst_over(r.errors, lab.noise_squares_with(r.base))) > unexplained(lab)
+    return r.over > unexplained(lab) or r.held_out_over(lab.fitted) > ABOVE
 
 
 def first_look(
