@@ -66,7 +66,7 @@ SEARCHES = {  # constants of the same files that steer the search, or only what 
     "floors": {"LED"},
     "next_effect": {"CONFIRMED", "PLAIN", "AS_WELL", "MEMBERS"},
     "choosing": {"CLEARLY", "LOOKS", "AS_SURE"},
-    "intervals": {"QUANTILE", "NORMAL", "ROOM", "NEARBY", "FREE_AT", "HALF_TURN", "FIRST_STEP", "TRIES", "PROFILED", "CLOSE"},
+    "intervals": {"QUANTILE", "NORMAL", "ROOM", "NEARBY", "FREE_AT", "HALF_TURN", "FIRST_STEP", "TRIES", "PROFILED", "AT_LEAST", "CLOSE"},
     "likelihood": {"SCALES"},
     "calibration": {"TABLE"},
 }  # fmt: skip

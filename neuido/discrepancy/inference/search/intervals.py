@@ -26,8 +26,10 @@ FIRST_STEP = 0.125
 """Half of the first step of a profile, in typical steps of the parameter; each further one is twice as long."""
 TRIES = 14
 """Refits of each end of a profile at the most: ten doublings reach a hundred typical steps, and four more halve what is left."""
-PROFILED = 6
-"""Number of fitted parameters up to which all intervals are profiled where one linear interval fails; with more it would take too long."""
+PROFILED = 4
+"""Number of fitted parameters up to which all intervals are profiled where one linear interval fails; with more, those that fail."""
+AT_LEAST = 1000
+"""Simulations that all profiles of a diagnosis may take, however few the search took."""
 CLOSE = 0.03
 """Relative error of the root of the rise at which the end of a profile is found."""
 NEARBY = 0.02
@@ -109,7 +111,8 @@ def profiled(
     """Return 90 % intervals by the profile of the misfit: the values with which a refit of the others leaves as little as chance allows.
 
     The unit of the misfit is what the fit leaves for each datum, as to first order. Directions are looked for within a quarter of a turn on
-    either side, which is every direction of an axis.
+    either side, which is every direction of an axis. Profiles take no more simulations than all that was done before them, or `AT_LEAST`;
+    an interval that is not found by then is left out.
 
     Args:
         lab: The method that predicts.
@@ -123,18 +126,19 @@ def profiled(
     left = np.concatenate([white(lab.residual(fit.point, n), n) for n in lab.fitted_recordings])
     rise = NORMAL * float(np.sqrt(np.mean(left**2)))
     every = [lab.problem.parameter(name) for name in fit.names]
-    anew = lab.fits([lab.request(every, start, until=math.inf) for start in (fit.point, *(_moved(fit.point, p) for p in still))], floor)
+    anew = lab.fits([lab.request(every, start, until=math.inf) for start in _starts(fit.point, still)], floor, step="intervals")
     least = min(lab.costs([fit.point, *(one.point for one in anew)], floor))
     ends = [_End(p, fit, side) for p in parameters for side in (-1, 1)]
+    before = lab.memo.simulations
     for _ in range(TRIES):
         open_ends = [end for end in ends if not end.found]
-        if not open_ends:
+        if not open_ends or lab.memo.simulations > before + max(before, AT_LEAST):
             break
         tried = [end.next(rise) for end in open_ends]
         begun = [
             (i, {**start, end.parameter.name: end.parameter.physical(q)})
             for i, (end, q) in enumerate(zip(open_ends, tried, strict=True))
-            for start in (end.point, *(_moved(end.point, p) for p in still if p is not end.parameter))
+            for start in _starts(end.point, [p for p in still if p is not end.parameter])
         ]
         requests = [
             lab.request(others[open_ends[i].parameter.name], start, until=math.inf, iterations=8, tolerance=discretisation.ROUGH)
@@ -144,14 +148,17 @@ def profiled(
         for i, (end, q) in enumerate(zip(open_ends, tried, strict=True)):
             found = min((one for (j, _), one in zip(begun, fits, strict=True) if j == i), key=lambda one: one.cost)
             end.take(q, found, math.sqrt(max(found.cost - least, 0.0)), rise)
-    values = {(end.parameter.name, end.side): end.parameter.physical(end.inside[0]) for end in ends}
-    return {p.name: (values[p.name, -1], values[p.name, 1]) for p in parameters}
+    pairs = zip(parameters, ends[::2], ends[1::2], strict=True)
+    return {p.name: (p.physical(low.inside[0]), p.physical(high.inside[0])) for p, low, high in pairs if low.found and high.found}
 
 
-def _moved(point: Point, p: Parameter) -> Point:
-    """Return a point with one parameter a typical step further, or back where that would leave its range."""
-    there = p.physical(p.coordinate(point[p.name]) + 1.0)
-    return {**point, p.name: there if there != point[p.name] else p.physical(p.coordinate(point[p.name]) - 1.0)}
+def _starts(point: Point, still: Sequence[Parameter]) -> list[Point]:
+    """Return the points from which a refit begins: a point, and where slopes may be zero the same with these parameters moved by a step."""
+    away = {}
+    for p in still:
+        q = p.coordinate(point[p.name])
+        away[p.name] = p.physical(q + 1.0) if q + 1.0 <= _range(p, q)[1] else p.physical(q - 1.0)
+    return [point, {**point, **away}] if away else [point]
 
 
 def _range(parameter: Parameter, q: float) -> tuple[float, float]:
