@@ -197,7 +197,7 @@ def is_unexplained(lab: Laboratory, r: Round) -> bool:
     Where nothing is discretised, that of its worst part counts: what one recording shows is not less there because others do not show it.
     """
     if lab.problem.settings == 1:
-        return max(r.over, worst_over(r.errors, lab.noise_squares_with(r.base))) > unexplained(lab)
+        return max(r.over, worst_over(r.errors, r.floors)) > unexplained(lab)
     return r.over > unexplained(lab) or r.held_out_over(lab.fitted) > ABOVE
 
 
