@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from neuido.data.measured.track import Track
+from neuido.discrepancy.inference.power import excess
 from neuido.discrepancy.problems.problem import Point, Problem
 
 CALIBRATION = 0.05
@@ -19,9 +20,10 @@ centimetre, than to ten, which launches of one experiment differ by."""
 def rival_scale(problem: Problem, before: Point, after: Point, count: int) -> list[float] | None:
     """Return the smallest and the largest error of the length scale by which the model without effects explains as much as with them.
 
-    The scale of each fitted recording has a Gaussian prior, of `CALIBRATION` or what the folder states if that is more. It explains as much
-    if Schwarz's criterion does not prefer the effects: misfit and prior together exceed those with the effects by no more than log n for
-    each of their parameters, n data. Where the effects leave more than the noise, their misfit sets the unit (Birge's ratio).
+    The errors are those at the far ends of the paths. The scale of each fitted recording has a Gaussian prior, of `CALIBRATION` or what the
+    folder states if that is more, and may change by as much along the path, as for a camera that looks askew. It explains as much if
+    Schwarz's criterion does not prefer the effects: misfit and prior together exceed those with the effects by no more than log n for each
+    of their parameters, n independent data. What the effects leave for each of these sets the unit (`power.excess`).
 
     Args:
         problem: What was diagnosed.
@@ -35,12 +37,19 @@ def rival_scale(problem: Problem, before: Point, after: Point, count: int) -> li
     if not hasattr(problem, "with_scale_error") or problem.unit != "m":
         return None
     other, fitted = problem.with_scale_error(CALIBRATION), problem.roles["fit"]
-    data = sum(len(problem.recordings[n].y) for n in fitted)
-    left, by_scale = (sum(one.misfit(point, n) for n in fitted) for one, point in ((problem, after), (other, before)))
-    if not by_scale - left <= count * math.log(data) * max(left / data, 1.0):
+    rows = [problem.whitened([after], n)[0] for n in fitted]
+    independent = sum(_independent(row, len(problem.recordings[n].y), len(problem.axes)) for row, n in zip(rows, fitted, strict=True))
+    left = float(np.sum(np.concatenate(rows) ** 2))
+    by_scale, found = zip(*(other.misfit_by_scale(before, n) for n in fitted), strict=True)
+    if not sum(by_scale) - left <= count * math.log(independent) * max(left / independent, 1.0):
         return None
-    found = [other.nuisances_of(before, n)[f"length_scale:{problem.recordings[n].name}"] for n in fitted]
     return [min(found, key=abs), max(found, key=abs)] if min(found) > 0 or max(found) < 0 else None
+
+
+def _independent(row: np.ndarray, data: int, axes: int) -> float:
+    """Return how many of the whitened residuals of a recording, frame by frame along its axes, are independent."""
+    _, freedom = excess(row[:data], np.empty((data, 0)), [np.arange(a, data, axes) for a in range(axes)])
+    return freedom + 1
 
 
 def of_another_scale(tracks: Sequence[Track]) -> list[tuple[Track, float]]:

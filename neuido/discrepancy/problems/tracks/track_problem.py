@@ -148,11 +148,20 @@ class TrackProblem(Problem):
         values = settle(start, forces, len(points), early or len(track.t))
         return start.seen(values, forces, track.t)[:, early:], values
 
-    def misfit(self, point: Point, recording: int) -> float:
-        """Return the sum of squares of what a fitted recording leaves, in units of the noise and of the priors of its nuisances."""
-        return float(np.sum(self._left([point], recording) ** 2))
+    def misfit_by_scale(self, point: Point, recording: int) -> tuple[float, float]:
+        """Return the sum of squares of `whitened` with a scale that may change along the path too, and its error at the far end.
 
-    def _left(self, points: Sequence[Point], recording: int) -> np.ndarray:
+        One standard deviation of the change is that of the scale (`released.scale_gradient`); what it explains is to first order.
+        """
+        start, left = self._starts[recording], self.whitened([point], recording)[0]
+        column = scale_gradient(start, self.forces([point], self._flights[recording]))
+        column = np.concatenate([start.whiten(column[None]).reshape(-1), np.zeros(len(left) - column.size)])
+        along, square = float(column @ left), 1.0 + float(column @ column)
+        own = next(p for p in start.parameters if p.name.startswith("length_scale"))
+        far = self.nuisances_of(point, recording)[own.name] - along / square * own.scale * own.prior
+        return float(left @ left) - along**2 / square, far
+
+    def whitened(self, points: Sequence[Point], recording: int) -> np.ndarray:
         """Return the whitened residuals of a fitted recording and its nuisances in units of their priors, (P, m)."""
         seen, values = self._profile(points, recording)
         start = self._starts[recording]
@@ -267,7 +276,7 @@ class TrackProblem(Problem):
                 asked += [shape | {name: step} for name, step in own]
         columns, left = [], []
         for n in self.roles["fit"] if spans else ():
-            r = self._left(asked, n)
+            r = self.whitened(asked, n)
             columns.append((r[1:] - r[0]).T)
             left.append(r[0])
         out: dict[str, tuple[np.ndarray, np.ndarray]] = {}
