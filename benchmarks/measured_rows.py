@@ -171,7 +171,7 @@ def _line(entry: Mapping[str, Any], r: Mapping[str, str] | None) -> list[str]:
     if r is None:
         return [entry["title"], entry["earlier"], *[""] * 5]
     named = r["named"].replace("_", " ") or r["answer"]
-    answer = named + (f" (or {r['in_class'].replace('_', ' ').replace(' ', ', ')})" if r["in_class"] else "")
+    answer = named + (f" (or {', '.join(r['in_class'].split()).replace('_', ' ')})" if r["in_class"] else "")
     over, errors = r["over_floor"] + (", said" if r["said"] else ""), f"{r['before']}, {r['after']} {r['unit']}"
     return [entry["title"], answer, r["size"], errors, over, r["rivals"].replace("_", " "), r["seconds"]]
 
