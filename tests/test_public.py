@@ -39,7 +39,7 @@ PUBLIC = {
     """,
     "neuido.physics": "FiniteElements Frames MassSpring Mesh PlaneMotion PlaneSpecimen Simulator colliders effects laws mesh_body",
     "neuido.physics.colliders": """
-        Capsule ColliderFrames ColliderTable Cuboid Cylinder HalfSpace HeightField MeshCollider SolidInputs Sphere
+        Capsule ColliderFrames ColliderTable Cuboid Cylinder Grip HalfSpace HeightField MeshCollider SolidInputs Sphere
         collider_table planes_of
     """,
     "neuido.physics.effects": "Effects Entry LIBRARY Parameter ball_inclusion linear_gradient",

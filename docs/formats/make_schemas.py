@@ -103,7 +103,7 @@ CONTACT = one_of(["sticky", "slip", "separate"])
 PLANE = record({"type": one_of(["plane"]), "point": VECTOR, "normal": VECTOR, "contact": CONTACT}, {"friction": NOT_NEGATIVE})
 COLLIDERS = {"type": ["array", "null"], "items": PLANE}
 QUATERNION: Schema = {"type": "array", "items": NUMBER, "minItems": 4, "maxItems": 4, "description": "w, x, y, z"}
-PATH = record({"times": some(NUMBER), "positions": some(VECTOR)}, {"rotations": some(QUATERNION)})
+PATH = record({"times": some(NUMBER), "positions": some(VECTOR)}, {"rotations": some(QUATERNION), "smooth": {"type": "boolean"}})
 SHARED: dict[str, Schema] = {
     "name": {"type": "string"},
     "position": VECTOR,
@@ -143,6 +143,11 @@ SCENE_WITH_SOLIDS = {
     **SCENE,
     "properties": SCENE["properties"] | {"colliders": {"type": ["array", "null"], "items": {"oneOf": [PLANE, KIND_PLANE, *SOLIDS]}}},
 }
+MEASURED_SCENE = {
+    **SCENE,
+    "properties": SCENE["properties"] | {"clamps": {"type": ["array", "null"], "items": record({"box": BOX}, {"name": TEXT})}},
+}
+HELD: Schema = {"type": ["object", "null"], "additionalProperties": record({}, {"motion": TEXT, "force": TEXT, "noise": POSITIVE})}
 GRID = record({"grid": {"type": "integer", "minimum": 4}, "dt": POSITIVE})
 FREE = {"type": "array", "items": TEXT, "uniqueItems": True}
 
@@ -174,13 +179,13 @@ def schemas() -> dict[str, Schema]:
             {
                 "format": one_of(["neuido-experiment/1"]),
                 "name": TEXT,
-                "scene": SCENE,
+                "scene": MEASURED_SCENE,
                 "model": {"anyOf": [own, neural]},
                 "discretisation": GRID,
                 "recordings": some(
                     record(
                         {"name": TEXT, "role": role, "frame_interval": POSITIVE},
-                        {"noise": NOT_NEGATIVE, "gravity": VECTOR, "attached_masses": MASSES, "colliders": COLLIDERS},
+                        {"noise": NOT_NEGATIVE, "clamps": HELD, "gravity": VECTOR, "attached_masses": MASSES, "colliders": COLLIDERS},
                     )
                 ),
             }

@@ -311,7 +311,13 @@ def experiment_problem(experiment: "Experiment", data: str, device: str) -> "Bod
         tracked = [r.x is not None for r in experiment.recordings]
         data = "points" if all(tracked) or all(r.video is None for r in experiment.recordings) else "video"
     if data == "points":
+        if any(r.clamps for r in experiment.recordings):
+            from neuido.discrepancy.problems.clamped import clamped_problem
+
+            return clamped_problem(experiment, device=device)
         return body_problem(experiment, device=device)
+    if any(r.clamps for r in experiment.recordings):
+        raise UserError("data = video: clamps with a name need tracked points; leave it out")
     from neuido.discrepancy.problems.video import video_problem
 
     return video_problem(experiment, device=device)
@@ -332,6 +338,8 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
     from neuido.discrepancy.problems.settings import SETTINGS
 
     own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
+    if not own:
+        raise UserError(f"solver = {solver}: it moves no clamps and has no forces on them; leave it out")
     if solver == "material_points":  # these settings are the first ones
         object.__setattr__(problem, "settings", sum(s.solver == solver for s in SETTINGS))
     object.__setattr__(problem, "solvers", own)

@@ -8,6 +8,7 @@ import numpy as np
 
 from neuido.errors import UserError
 from neuido.export.splats import MovingSplats
+from neuido.physics.colliders.solids import Grip
 from neuido.types import Cameras, Plane, Scene
 
 NEAREST_SAMPLED = 4000
@@ -158,7 +159,7 @@ def exchange_of(motion: Any, *, every: int = 1, scene: Scene | None = None) -> E
     made = Exchange(times[::every], x[::every], *(None if part is None else part[::every] for part in (v, F)), spacing_of(x[0]), ())
     made.parts = _parts(motion, x.shape[1], made)
     made.surfaces = tuple(_skin(skin, motion, i, every) for i, skin in enumerate(getattr(motion, "skins", None) or ()))
-    own = tuple(getattr(motion, "colliders", None) or ())
+    own = tuple(each for each in getattr(motion, "colliders", None) or () if not isinstance(getattr(each, "shape", None), Grip))
     colliders = [_collider(each, i, every, made, scene) for i, each in enumerate(own)]
     if scene is not None:
         down = np.asarray(scene.gravity, float)

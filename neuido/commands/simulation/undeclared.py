@@ -29,7 +29,7 @@ def undeclared(
     Args:
         out: Folder to write; its name is the name of the case.
         seed: Seed of everything that is drawn.
-        measured: body (an experiment), material_test or track.
+        measured: body (an experiment), driven (a bar pulled by a clamp, with its forces), material_test, track or guided.
         kind: The effect that is not declared: one of the vocabulary, one outside it, `none`, or two joined by a plus sign; drawn
             where absent, as all that follows.
         solver: Of a body: same (the grid and step that the folder suggests), finer (36 to 44 cells, half the step) or elements

@@ -102,13 +102,16 @@ def solid_from_dict(given: Mapping[str, Any], where: str, find: Callable[[str, s
 
 def _path(given: Any, where: str) -> Keyframes:
     """Build the motion of a collider from its entry `path`."""
-    check_keys(given, where, ("times", "positions", "rotations"), ("rotations",))
+    check_keys(given, where, ("times", "positions", "rotations", "smooth"), ("rotations", "smooth"))
     times = tuple(number(t, f"{where}.times") for t in _list(given["times"], f"{where}.times"))
     positions = tuple(vector(p, f"{where}.positions") for p in _list(given["positions"], f"{where}.positions"))
     rotations = given.get("rotations")
     if rotations is not None:
         rotations = tuple(_numbers(q, f"{where}.rotations", 4) for q in _list(rotations, f"{where}.rotations"))
-    return Keyframes(times, positions, rotations)
+    smooth = given.get("smooth", False)
+    if not isinstance(smooth, bool):
+        raise UserError(f"{where}.smooth must be true or false, got {smooth!r}")
+    return Keyframes(times, positions, rotations, smooth)
 
 
 def _list(given: Any, where: str) -> list:

@@ -219,7 +219,7 @@ def scene_from_dict(scene: Mapping[str, Any], discretisation: Mapping[str, Any],
         gravity=vector(scene["gravity"], "scene.gravity"),
         colliders=tuple(_collider(c, f"scene.colliders[{i}]", find) for i, c in enumerate(colliders)),
         walls=_walls(scene["walls"]) if "walls" in scene else Walls(),
-        clamps=tuple(_boxed(c, f"scene.clamps[{i}]") for i, c in enumerate(_list(scene, "clamps"))),
+        clamps=tuple(box_from_dict(c, f"scene.clamps[{i}]") for i, c in enumerate(_list(scene, "clamps"))),
         attached_masses=tuple(_attached(m, f"scene.attached_masses[{i}]") for i, m in enumerate(_list(scene, "attached_masses"))),
     )
 
@@ -418,7 +418,12 @@ def _attached(given: Any, where: str) -> AttachedMass:
     return AttachedMass(_box(given["box"], f"{where}.box"), number(given["mass"], f"{where}.mass", above=0.0))
 
 
-def _boxed(given: Any, where: str) -> Box:
+def box_from_dict(given: Any, where: str) -> Box:
+    """Read an entry whose one key is a `box`.
+
+    Raises:
+        UserError: Another key, or no box.
+    """
     given = mapping(given, where)
     check_keys(given, where, ("box",))
     return _box(given["box"], f"{where}.box")

@@ -132,6 +132,36 @@ def optional_numbers(cells: Sequence[str], name_row: Callable[[int], str]) -> np
     return np.array([np.nan if lacks else float(cell) for cell, lacks in zip(cells, missing)])
 
 
+def named_columns(
+    folder: Path, file: Any, where: str, wanted: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()
+) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
+    """Read columns of a CSV file by their titles; return them as numbers (NaN: an empty cell), and optional columns of words as text.
+
+    Raises:
+        UserError: The file or a wanted column is missing, a title stands twice, or a cell is no number.
+    """
+    path = path_inside(folder, file, where)
+    if not path.is_file():
+        raise UserError(f"{where}: the file {path} is missing")
+    table = read_delimited(path)
+    if len(table.rows) < 2:
+        raise UserError(f"{where}: {path.name} has no rows below its titles")
+    titles, rows = [cell.strip() for cell in table.rows[0]], table.rows[1:]
+    if missing := [title for title in wanted if title not in titles]:
+        raise UserError(f"{where}: {path.name} has no column {missing[0]!r}; its columns are {', '.join(titles)[:120]}")
+    numbers, texts = {}, {}
+    for title in (*wanted, *(t for t in (*optional, *words) if t in titles)):
+        if titles.count(title) > 1:
+            raise UserError(f"{where}: {path.name} has {titles.count(title)} columns named {title!r}")
+        at = titles.index(title)
+        cells = [row[at].strip() if at < len(row) else "" for row in rows]
+        if title in words:
+            texts[title] = cells
+        else:
+            numbers[title] = optional_numbers(cells, lambda i, title=title: f"{where}: {path.name}, line {table.lines[i + 1]}, {title}")
+    return numbers, texts
+
+
 def read_effects(given: Any, where: str, *, known: tuple[str, ...]) -> dict[str, float]:
     """Read the effects that a model declares; return their parameters by flat names, for example {"drag_quadratic.k": 0.01}.
 

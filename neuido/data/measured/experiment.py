@@ -17,6 +17,7 @@ from neuido.data.files.values import check_keys, file_name, mapping, number, pat
 from neuido.data.files.writing import copy_file, write_arrays, write_text
 from neuido.data.formats import nerfstudio
 from neuido.data.formats.layout import MultiView
+from neuido.data.measured.clamps import Clamp, check_clamps, clamp_entries, held_scene, read_clamps, split_clamps, write_clamps
 from neuido.data.measured.columns import errors_of, read_effects, read_entries, read_free, read_header, read_role, read_text
 from neuido.data.measured.motion_plausibility import check_motion, check_positions, mask_unseen
 from neuido.data.measured.plausibility import check_density
@@ -40,7 +41,7 @@ class Recording:
     role: str
     """`fit` or `held_out`; held-out recordings are scored but never fitted."""
     scene: Scene
-    """The experiment's scene with this recording's own gravity, colliders and attached masses."""
+    """The experiment's scene with this recording's own gravity, colliders and attached masses, without the clamps that have a name."""
     frame_interval: float
     """Nominal time from one frame to the next [s]; `t` has the true times."""
     noise: float | None = None
@@ -59,6 +60,13 @@ class Recording:
     """Cameras and images."""
     gaussians: Path | None = None
     """The first frame as a 3DGS PLY."""
+    clamps: tuple[Clamp, ...] = ()
+    """The clamps that have a name, with their motion and force in this recording."""
+
+    @property
+    def held_scene(self) -> Scene:
+        """The scene with the clamps that have a name, for a simulation."""
+        return held_scene(self.scene, self.clamps) if self.clamps else self.scene
 
     @property
     def seen(self) -> Tensor:
@@ -110,10 +118,11 @@ def read_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] | None 
     with errors_of(file):
         check_keys(content, "the file", ("format", "name", "scene", "model", "discretisation", "recordings"))
         name = read_text(content["name"], "name")
+        content["scene"], boxes = split_clamps(content["scene"])
         scene = scenes.scene_from_dict(content["scene"], content["discretisation"])
         declared, free = read_declared_model(content["model"] if model is None else model, folder=folder)
         recordings = read_entries(
-            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder)
+            content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, content, folder, boxes)
         )
     return Experiment(name, folder, scene, declared, free, recordings)
 
@@ -128,6 +137,7 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
     if (folder / "experiment.yaml").exists():
         raise UserError(f"{folder} contains an experiment already: give another folder")
     scene, discretisation = scene_to_dict(experiment.scene)
+    scene["clamps"] += clamp_entries(experiment.recordings[0].clamps)
     content: dict[str, Any] = {
         "format": FORMAT,
         "name": experiment.name,
@@ -138,13 +148,16 @@ def write_experiment(experiment: Experiment, path: str | os.PathLike) -> None:
     }
     for recording in experiment.recordings:
         own, grid = scene_to_dict(recording.scene)
+        own["clamps"] += clamp_entries(recording.clamps)
         changed = {key: own[key] for key in OVERRIDES if own[key] != scene[key]}
         if grid != discretisation or any(own[key] != scene[key] for key in own if key not in OVERRIDES):
             raise UserError(f"recording {recording.name} differs from the experiment in more than {', '.join(OVERRIDES)}")
         entry = {"name": recording.name, "role": recording.role, "frame_interval": recording.frame_interval, **changed}
-        content["recordings"].append(entry if recording.noise is None else {**entry, "noise": recording.noise})
+        entry |= {} if recording.noise is None else {"noise": recording.noise}
         path_inside(folder, recording.name, "name of the recording").mkdir(parents=True, exist_ok=True)
         _write_files(recording, folder / recording.name)
+        held = write_clamps(recording.clamps, folder, recording.name)
+        content["recordings"].append(entry | ({"clamps": held} if held else {}))
     write_text(folder / "experiment.yaml", yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True))
 
 
@@ -218,8 +231,8 @@ def read_model(given: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
     return model, free
 
 
-def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path) -> Recording:
-    check_keys(entry, where, ("name", "role", "frame_interval", "noise", *OVERRIDES), ("noise", *OVERRIDES))
+def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path, boxes: Mapping[str, Box]) -> Recording:
+    check_keys(entry, where, ("name", "role", "frame_interval", "noise", "clamps", *OVERRIDES), ("noise", "clamps", *OVERRIDES))
     name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     role = read_role(entry["role"], where)
@@ -244,6 +257,11 @@ def _recording(entry: Any, where: str, content: Mapping[str, Any], folder: Path)
         _check_boxes(scene, fields["body"].x, where)
     if (own / "transforms.json").is_file():
         fields["video"] = nerfstudio.read(own)
+    if boxes or entry.get("clamps"):
+        fields["clamps"] = read_clamps(entry.get("clamps"), boxes, folder, where)
+        if "x" not in fields:
+            raise UserError(f"{where}: clamps with a name need tracked points, and {own} has no particles.npz")
+        check_clamps(fields["clamps"], scene, fields, where)
     gaussians = own / "gaussians.ply"
     return Recording(
         name=name,

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from neuido.data.files.delimited import read_delimited
-from neuido.data.files.values import check_keys, file_name, mapping, number, path_inside
+from neuido.data.files.values import check_keys, file_name, mapping, number
 from neuido.data.measured.columns import (
     errors_of,
-    optional_numbers,
+    named_columns,
     read_effects,
     read_entries,
     read_free,
@@ -152,8 +151,8 @@ def _model(given: Any) -> tuple[dict[str, Any], tuple[str, ...], dict[str, float
 def _specimen(given: Any, folder: Path) -> tuple[PlaneSpecimen, dict[str, list[str]]]:
     """Return the specimen, and by axis the name of the part of the boundary of each node (empty: free)."""
     check_keys(given, "specimen", ("nodes", "elements", "thickness", "condition"))
-    nodes, texts = _table(folder, given["nodes"], "specimen.nodes", AXES, tuple(f"boundary_{a}" for a in AXES))
-    elements, _ = _table(folder, given["elements"], "specimen.elements", ("node1", "node2", "node3"), ("node4",))
+    nodes, texts = named_columns(folder, given["nodes"], "specimen.nodes", AXES, words=tuple(f"boundary_{a}" for a in AXES))
+    elements, _ = named_columns(folder, given["elements"], "specimen.elements", ("node1", "node2", "node3"), ("node4",))
     corners = np.stack([elements[f"node{i}"] for i in (1, 2, 3)], 1)
     if "node4" in elements:
         corners = np.column_stack([corners, elements["node4"]])
@@ -212,7 +211,7 @@ def _recording(entry: Any, where: str, folder: Path, specimen: PlaneSpecimen, bo
         raise UserError(f"{where}.displacements must be a list of files, one a load step, got {files!r}")
     count, steps = len(specimen.nodes), []
     for i, given in enumerate(files):
-        columns, _ = _table(folder, given, f"{where}.displacements[{i}]", ("ux", "uy"), ())
+        columns, _ = named_columns(folder, given, f"{where}.displacements[{i}]", ("ux", "uy"))
         if len(columns["ux"]) != count:
             raise UserError(
                 f"{where}.displacements[{i}]: {given} has {len(columns['ux'])} rows and there are {count} nodes: give a row each"
@@ -220,7 +219,7 @@ def _recording(entry: Any, where: str, folder: Path, specimen: PlaneSpecimen, bo
         steps.append(np.stack([columns["ux"], columns["uy"]], 1))
     force = np.full((len(files), len(boundary)), np.nan)
     if entry.get("forces") is not None:
-        columns, _ = _table(folder, entry["forces"], f"{where}.forces", (), tuple(part.name for part in boundary))
+        columns, _ = named_columns(folder, entry["forces"], f"{where}.forces", (), tuple(part.name for part in boundary))
         if not columns:
             names = ", ".join(part.name for part in boundary)
             raise UserError(f"{where}.forces: {entry['forces']} names no part of the boundary: title its columns {names}")
@@ -234,32 +233,6 @@ def _recording(entry: Any, where: str, folder: Path, specimen: PlaneSpecimen, bo
     check_keys(noise, f"{where}.noise", ("displacement", "force"), ("displacement", "force"))
     stated = {key: number(value, f"{where}.noise.{key}", above=0.0) for key, value in noise.items()}
     return PlaneRecording(name, role, np.stack(steps), force, stated.get("displacement"), stated.get("force"))
-
-
-def _table(
-    folder: Path, file: Any, where: str, wanted: Sequence[str], optional: Sequence[str]
-) -> tuple[dict[str, np.ndarray], dict[str, list[str]]]:
-    """Read columns of a CSV file by their titles; return them as numbers (NaN: an empty cell), and those of `optional` as text too."""
-    path = path_inside(folder, file, where)
-    if not path.is_file():
-        raise UserError(f"{where}: the file {path} is missing")
-    table = read_delimited(path)
-    if len(table.rows) < 2:
-        raise UserError(f"{where}: {path.name} has no rows below its titles")
-    titles, rows = [cell.strip() for cell in table.rows[0]], table.rows[1:]
-    if missing := [title for title in wanted if title not in titles]:
-        raise UserError(f"{where}: {path.name} has no column {missing[0]!r}; its columns are {', '.join(titles)[:120]}")
-    numbers, texts = {}, {}
-    for title in (*wanted, *(t for t in optional if t in titles)):
-        if titles.count(title) > 1:
-            raise UserError(f"{where}: {path.name} has {titles.count(title)} columns named {title!r}")
-        at = titles.index(title)
-        cells = [row[at].strip() if at < len(row) else "" for row in rows]
-        texts[title] = cells
-        if title.startswith("boundary_"):
-            continue
-        numbers[title] = optional_numbers(cells, lambda i, title=title: f"{where}: {path.name}, line {table.lines[i + 1]}, {title}")
-    return numbers, texts
 
 
 def _check(found: PlaneExperiment) -> None:

@@ -8,7 +8,8 @@ class Case:
     """Fixed properties of a case with an undeclared effect; the others are drawn at random.
 
     Args:
-        measured: body (an experiment folder), material_test, track, or guided (tracks of pendulums, springs, axes, planes, bounces, discs).
+        measured: body (an experiment folder), driven (a bar pulled by a clamp, with its forces), material_test, track, or guided (tracks of
+            pendulums, springs, axes, planes, bounces, discs).
         kind: An effect of the library, an effect outside the library, `none`, or two effects of the library joined by a plus sign.
         solver: Solver of a body: same (grid and substep that the folder suggests), finer (36 to 44 cells, half the substep) or elements
             (finite elements).

@@ -17,6 +17,7 @@ from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import TEST_OUTSIDE, curve_case
+from neuido.data.undeclared.driven.driven_bodies import driven_case
 from neuido.data.undeclared.guided_tracks import guided_case
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
 from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
@@ -25,6 +26,7 @@ from neuido.physics.effects.point_library import POINT_ENTRIES
 from neuido.physics.runtime.device import choose_device
 from neuido.physics.runtime.limits import check_limit
 
+MEASURED = ("body", "driven", "material_test", "track", "guided")
 TRIES = 12
 """Largest number of random draws for a seed."""
 SHORTEST_STEP = 6.25e-5
@@ -58,7 +60,7 @@ def make_sealed_case(seed: int, out: str | Path, *, case: Case, device: str, pro
 
 def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], device: str, progress: bool) -> str:
     """Fill a folder with a case, and return the text of its key."""
-    maker = {"body": body_case, "guided": guided_case}.get(case.measured, curve_case)
+    maker = {"body": body_case, "driven": driven_case, "guided": guided_case}.get(case.measured, curve_case)
     with Progress(f"case {name}", unit="simulations", shown=progress) as work:
         for attempt in range(TRIES):
             rng = np.random.default_rng([seed, attempt])
@@ -81,11 +83,11 @@ def _make(seed: int, hidden: Path, name: str, case: Case, plan: dict[str, Any], 
 
 
 def _check(case: Case) -> None:
-    if case.measured not in ("body", "material_test", "track", "guided"):
-        raise UserError(f"measured = {case.measured!r} is unknown: choose from body, material_test, track, guided")
+    if case.measured not in MEASURED:
+        raise UserError(f"measured = {case.measured!r} is unknown: choose from {', '.join(MEASURED)}")
     if case.solver is not None and case.solver not in SOLVERS:
         raise UserError(f"solver = {case.solver!r} is unknown: choose from {', '.join(SOLVERS)}")
-    if case.kind is not None and case.kind != "none" and case.measured != "guided":
+    if case.kind is not None and case.kind != "none" and case.measured not in ("driven", "guided"):
         tests = (*(entry.name for entry in POINT_ENTRIES), *TEST_OUTSIDE) if case.measured == "material_test" else ()
         known = (*KINDS, *OUTSIDE, *tests)
         for kind in case.kind.split("+"):

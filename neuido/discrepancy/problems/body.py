@@ -160,6 +160,10 @@ class BodyProblem(BodyRollouts):
     def together(self) -> bool:
         return self.device != "cpu"
 
+    def coordinates(self, recording: int) -> int:
+        """Return how many of the data are coordinates of tracked points: the first ones."""
+        return len(self.recordings[recording].y)
+
     def error(self, residual: np.ndarray, recording: int) -> float:
         return float(np.sqrt(3.0 * np.mean(residual**2)))
 
@@ -256,10 +260,15 @@ class BodyProblem(BodyRollouts):
         centre = x[0].mean(axis=0)
         return centre + (1.0 + value["length_scale"]) * (x + (value["release_time"] + value["time_base"] * t) * v - centre)
 
-    def _tracked_motion(self, runs: Sequence[Motions], setting: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Simulate, and return positions [m] and velocities [m/s] of the tracked points of each recording, (S, T, N, 3) each."""
+    def _tracked_motion(
+        self, runs: Sequence[Motions], setting: int, pushed: list[body_launches.Pushes] | None = None
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Simulate, and return positions [m] and velocities [m/s] of the tracked points of each recording, (S, T, N, 3) each.
+
+        What the clamps give to the body is added to `pushed`.
+        """
         out = []
-        for (_, recording), frames in zip(runs, self._move(runs, setting), strict=True):
+        for (_, recording), frames in zip(runs, self._move(runs, setting, pushed=pushed), strict=True):
             index, weight = self._map(recording)
             x, v = (_gather(t, index, weight).transpose(0, 1).double().cpu().numpy() for t in (frames.x, frames.v))
             out.append((x, v))

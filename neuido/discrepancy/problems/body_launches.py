@@ -7,6 +7,7 @@ ten times the inner steps.
 
 import bisect
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.problems.problem import Candidate
+from neuido.physics.runtime.frames import Frames
 from neuido.types import ParticleState
 
 SEGMENT = 200
@@ -92,3 +94,22 @@ def at_times(frames: ParticleState, step: float, t: Tensor) -> ParticleState:
     place = (1 + 2 * u) * (1 - u) ** 2 * x0 + u * (1 - u) ** 2 * v0 + u**2 * (3 - 2 * u) * x1 + u**2 * (u - 1) * v1
     w = u[..., None]
     return ParticleState(place, ((1 - u) * v0 + u * v1) / step, (1 - w) * C[k] + w * C[k + 1], (1 - w) * F[k] + w * F[k + 1])
+
+
+class Pushes(NamedTuple):
+    """What the clamps of simulations give to the body."""
+
+    t: np.ndarray
+    """Times [s], (K,)."""
+    impulse: np.ndarray
+    """Momentum given from the start on [N s], (S, K, C, 3)."""
+
+
+def pushes_of(frames: Frames, scenes: Sequence[int], clamps: int) -> Pushes:
+    """Return the impulses of the clamps, which are the last colliders of a scene, on the bodies of some scenes."""
+    step = float(frames.dt[scenes[0] if len(frames.dt) > 1 else 0])
+    out = []
+    for s in scenes:
+        own = [each.force for each in frames.colliders if each.scene == s and each.force is not None][-clamps:]
+        out.append(-step * torch.stack(own, dim=1).cumsum(dim=0).cpu().numpy())
+    return Pushes(step * np.arange(len(frames.x)), np.stack(out))

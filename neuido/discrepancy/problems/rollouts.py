@@ -18,7 +18,7 @@ from torch import Tensor
 from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.problems import body_launches, settings
-from neuido.discrepancy.problems.body_launches import at_times, frames_until, segment_of, standing_still, substeps
+from neuido.discrepancy.problems.body_launches import Pushes, at_times, frames_until, pushes_of, segment_of, standing_still, substeps
 from neuido.discrepancy.problems.candidates import effects_of
 from neuido.discrepancy.problems.declared_model import laws_of
 from neuido.discrepancy.problems.problem import Point, Problem
@@ -47,6 +47,9 @@ FINER = (1, 2, 6)
 LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
 """Contact height [suggested cells]: its least change, its largest distance from the declared height, and the least gap at the start between
 body and colliders with which it may change."""
+
+PATH_SCALE = "path_scale"
+"""Name of a nuisance: relative error of the measured path of the clamps of a recording."""
 
 Motions = tuple[Sequence[Point], int]
 """Parameter sets, and the number of the recording that is simulated with each of them."""
@@ -138,7 +141,9 @@ class BodyRollouts(Problem):
         self._move([([point], recording)], setting, noted=noted)
         return noted
 
-    def _move(self, runs: Sequence[Motions], setting: int, finer: int = 0, noted: list[Event] | None = None) -> list[ParticleState]:
+    def _move(
+        self, runs: Sequence[Motions], setting: int, finer: int = 0, noted: list[Event] | None = None, pushed: list[Pushes] | None = None
+    ) -> list[ParticleState]:
         """Simulate recordings with several parameter sets each in one launch.
 
         Args:
@@ -146,6 +151,7 @@ class BodyRollouts(Problem):
             setting: Number of the setting.
             finer: Place in `FINER` of the factor on the inner steps.
             noted: List to which the events of the first motion are added.
+            pushed: List to which what the clamps give to the bodies of each run is added.
 
         Returns:
             Frames of each run, (T, S, P, ...) for S parameter sets. A motion that fails is NaN.
@@ -169,6 +175,10 @@ class BodyRollouts(Problem):
         steps = segment * math.ceil(steps / segment)  # on a GPU, what is captured for whole motions serves early ones too
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment}
+        if any(name.startswith(PATH_SCALE) for point, _ in filled for name in point):
+            scale = [1.0 + point.get(f"{PATH_SCALE}:{self.measured[n].name}", 0.0) for point, n in filled]
+            own = simulator.solid_inputs(steps)
+            given["solids"] = own._replace(twist=own.twist * own.twist.new_tensor(scale)[:, None, None])
         elements = EVERY[setting].solver == "finite_elements"
         if elements and len(inner := {self.inner_steps(point, setting) for points, _ in runs for point in points}) == 1 and any(inner):
             given["inner"] = inner.pop()
@@ -178,6 +188,10 @@ class BodyRollouts(Problem):
             else:
                 more = {"inner_factor": FINER[finer]} if elements else {}
                 out = simulator.rollout(steps, elasticity, plasticity, nan_on_failure=len(full) > 1 or finer > 0, **given, **more)
+        if pushed is not None:
+            pushed += [
+                pushes_of(out, range(k * size, k * size + len(points)), len(self.measured[n].clamps)) for k, (points, n) in enumerate(runs)
+            ]
         if noted is not None:
             noted += [event for event in out.events if event.scene == 0]
         if lifts.any():
@@ -320,7 +334,7 @@ class BodyRollouts(Problem):
         scenes, bodies, meshes = [], [], []
         for n in recordings:
             r = self.measured[n]
-            scenes += [replace(r.scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
+            scenes += [replace(r.held_scene, cells=round(r.scene.cells * s.cells), dt=r.scene.dt * s.dt)] * count
             bodies += [r.body] * count
             meshes += [self._mesh(n, s.elements, s.tetrahedra)] * count if s.solver == "finite_elements" else []
         density = self.experiment.model["density"]
@@ -413,7 +427,7 @@ def _up(r: Measured) -> np.ndarray:
 
     It is zero without colliders, where the body starts near one (`GAP`), and where the body is clamped, because clamps do not shift.
     """
-    free = r.scene.colliders and not r.scene.clamps and _gap(r) > GAP * r.scene.dx
+    free = r.scene.colliders and not (r.scene.clamps or r.clamps) and _gap(r) > GAP * r.scene.dx
     return np.unique(_normals(r), axis=0).sum(axis=0) if free else np.zeros(3)
 
 

@@ -125,6 +125,8 @@ def recordings_of(problem: Problem) -> dict[str, dict[str, Any]]:
         elif hasattr(own, "measured"):
             scene = own.measured[n].scene
             made |= {"gravity": [float(g) for g in scene.gravity], "colliders": [_plane(p) for p in scene.colliders]}
+            if getattr(own, "series", ()):
+                made["parts"] = [series.name for series in own.series[n]]
         elif hasattr(own, "pictured"):
             made |= {"quantity": "displacement", "parts": [part.name for part in own.experiment.boundary]}
         elif hasattr(own, "axes"):
@@ -402,8 +404,10 @@ def motions(d: Diagnosis) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, s
             continue
         for when, model in models.items():
             shown = model.copy()
-            shown[1:][seen[1:]] = own[when].reshape(-1, 3)
+            shown[1:][seen[1:]] = own[when][: problem.coordinates(n)].reshape(-1, 3)
             arrays |= {when: shown, f"{when}_model": model}
+        if hasattr(inner(problem), "pictured"):
+            arrays |= inner(problem).pictured({"before": d.before, "after": d.after}, n, d.setting)
         out[recording.name] = arrays
     return out, failed
 

@@ -77,10 +77,12 @@ def _samples(
         channels = r.groups[:, None] == np.unique(r.groups)[None]
         features = np.concatenate([r.times[:, None], predicted[:, None], velocity[:, None], channels], axis=1)
         return features[part.rows], left[part.rows, None], weight[part.rows]
-    x, place, speed = (v.reshape(-1, 3) for v in (predicted, *_body_features(d, n, predicted)))
-    rows = part.rows.reshape(-1, 3).all(axis=1)
-    features = np.concatenate([place, x, speed, r.times.reshape(-1, 3)[:, :1]], axis=1)
-    return features[rows], left.reshape(-1, 3)[rows], weight.reshape(-1, 3)[rows].mean(axis=1)
+    count = problem.coordinates(n)
+    x, place, speed = (v.reshape(-1, 3) for v in (predicted[:count], *_body_features(d, n, predicted[:count])))
+    features = np.concatenate([place, x, speed, r.times[:count].reshape(-1, 3)[:, :1]], axis=1)
+    rows, left, weight = (v[:count].reshape(-1, 3) for v in (part.rows, left, weight))
+    rows = rows.all(axis=1)
+    return features[rows], left[rows], weight[rows].mean(axis=1)
 
 
 def _body_features(d: Diagnosis, n: int, predicted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -88,9 +90,10 @@ def _body_features(d: Diagnosis, n: int, predicted: np.ndarray) -> tuple[np.ndar
     r = d.problem.recordings[n]
     first = d.problem.measured[n].x.double().numpy()
     whole = d.problem.measured[n].body.x.double().numpy()
-    point = r.groups.reshape(-1, 3)[:, 0] // 3
+    groups, times = r.groups[: len(predicted)], r.times[: len(predicted)]
+    point = groups.reshape(-1, 3)[:, 0] // 3
     start = np.where(np.isfinite(first[0]), first[0], whole.mean(axis=0))
-    return (start - whole.mean(axis=0))[point], _slope(predicted, r.times, r.groups)
+    return (start - whole.mean(axis=0))[point], _slope(predicted, times, groups)
 
 
 def _slope(values: np.ndarray, times: np.ndarray, groups: np.ndarray) -> np.ndarray:

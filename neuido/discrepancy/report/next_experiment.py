@@ -49,6 +49,8 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         return None
     inner, quick = getattr(d.problem, "problem", d.problem), d.problem.quick(d.setting)
     setting = quick if all(d.problem.bears(r.point, quick) for r in rivals) else d.setting
+    if any(r.clamps for r in getattr(inner, "measured", ())):  # no other path of a clamp is simulated
+        return None
     if hasattr(inner, "motion"):
         catalogue = _bodies(inner if inner.tracked else inner.as_tracked(), rivals[0].point, setting)
     elif hasattr(inner, "tests"):

@@ -155,6 +155,7 @@ def _section(c: Mapping[str, Any], motion: Motion, units: Units, figures: list[d
         add("Motion before and after", [motion_player.player(bodies, c, units, room=room)], form="player")
         add("Error over time", [plots.error_over_time(name, arrays, c, units, rows) for name, arrays in bodies.items()])
         add("Where on the body", [motion_player.residual_map(bodies, c, units)], form="map", note=_places(c, units))
+        add("Forces on the body", [p for name, arrays in bodies.items() for p in plots.force_plots(name, arrays, c)])
         add("Which stage", plots.stage_plots(c), note=WEAK)
     elif any("nodes" in arrays for arrays in motion.values()):
         add("The specimen before and after", [p for name, arrays in others.items() for p in plots.specimen_plots(name, arrays, c, units)],

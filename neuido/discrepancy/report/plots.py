@@ -179,14 +179,22 @@ def specimen_plots(name: str, arrays: Arrays, c: Mapping[str, Any], units: Units
         data.append(spots | {"marker": marker | {"colorbar": {"title": {"text": f"residual [{unit}]"}}}})
         square = {"yaxis": {"scaleanchor": "x"}}
         out.append(plot(f"{heading(name, c)}: {called}, last load step", f"x [{unit}]", f"y [{unit}]", data, **square))
-    steps = np.arange(1, len(arrays["force_measured"]) + 1)
+    return out + force_plots(name, arrays, c)
+
+
+def force_plots(name: str, arrays: Mapping[str, np.ndarray], c: Mapping[str, Any]) -> list[Plot]:
+    """Return a plot of the measured and predicted forces of a recording over time, or over the load steps; empty without forces."""
+    if "force_measured" not in arrays:
+        return []
+    timed = "force_times" in arrays
+    steps = arrays["force_times"] if timed else np.arange(1, len(arrays["force_measured"]) + 1)
     curves: list[Plot] = []
     for i, part in enumerate(c["recordings"].get(name, {}).get("parts", [])):
         if np.isfinite(arrays["force_measured"][:, i]).any():
             curves.append(dots(f"{part}, measured", steps, arrays["force_measured"][:, i], "measured", size=7))
             look = ("solid", "dash", "dot", "dashdot")[i % 4]
             curves += [line(f"{part}, {called}", steps, arrays[f"force_{when}"][:, i], when, dash=look) for when, called in predictions(c)]
-    return out + ([plot(f"{heading(name, c)}: forces", "load step", "force [N]", curves)] if curves else [])
+    return [plot(f"{heading(name, c)}: forces", "time [s]" if timed else "load step", "force [N]", curves)] if curves else []
 
 
 def stage_plots(c: Mapping[str, Any]) -> list[Plot]:

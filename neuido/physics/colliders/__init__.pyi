@@ -1,6 +1,6 @@
 from .collider_frames import ColliderFrames
 from .solid_tables import SolidInputs
-from .solids import Capsule, Cuboid, Cylinder, HalfSpace, HeightField, MeshCollider, Sphere
+from .solids import Capsule, Cuboid, Cylinder, Grip, HalfSpace, HeightField, MeshCollider, Sphere
 from .tables import ColliderTable, collider_table, planes_of
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "ColliderTable",
     "Cuboid",
     "Cylinder",
+    "Grip",
     "HalfSpace",
     "HeightField",
     "MeshCollider",

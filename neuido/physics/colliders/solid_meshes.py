@@ -20,7 +20,7 @@ class SolidMesh(NamedTuple):
 
 
 def mesh_of(shape: Any) -> SolidMesh | None:
-    """Return the surface of a collider; None of a half-space, which has no end.
+    """Return the surface of a collider; None of a half-space, which has no end, and of a grip.
 
     Args:
         shape: A collider; of a height field its upper side alone.

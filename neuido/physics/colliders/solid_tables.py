@@ -1,12 +1,13 @@
 """Tables of the solid colliders of scenes, as the kernels read them, and their motion as differentiable inputs of a rollout."""
 
-import bisect
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from neuido.errors import UserError
@@ -19,6 +20,7 @@ from neuido.types import Keyframes, Plane, Scene, Solid, brief_fields
 MARGIN = 1.25
 """Cells of the grid by which the samples of a mesh extend beyond it; the contact reaches one."""
 SHAPES = {
+    kinds.Grip: 0,
     kinds.HalfSpace: kinds.HALF_SPACE,
     kinds.Sphere: kinds.SPHERE,
     kinds.Cuboid: kinds.CUBOID,
@@ -121,7 +123,7 @@ def solid_table(scenes: Sequence[Scene], dtype: torch.dtype, device: torch.devic
     for s, (scene, row) in enumerate(zip(scenes, rows)):
         for c, solid in enumerate(row):
             damping[s, c] = damping_ratio(solid.restitution)
-            shape[s, c], kind[s, c] = SHAPES[type(solid)], CONTACTS[solid.contact]
+            shape[s, c], kind[s, c] = SHAPES[type(solid)], 0 if isinstance(solid, kinds.Grip) else CONTACTS[solid.contact]
             lengths, bound, dims, own = _geometry(solid, scene.dx)
             size[s, c], reach[s, c] = torch.tensor(lengths), bound
             info[s, c] = torch.tensor([sum(len(t) for t in samples), *dims], dtype=torch.int32)
@@ -152,6 +154,8 @@ def _geometry(solid: Solid, dx: float) -> tuple[tuple[float, ...], float, tuple[
     none = (0, 0, 0)
     if isinstance(solid, kinds.HalfSpace):
         return (0.0,) * 4, np.inf, none, None
+    if isinstance(solid, kinds.Grip):
+        return (0.0,) * 4, 0.0, none, None
     if isinstance(solid, kinds.Sphere):
         return (solid.radius, 0.0, 0.0, 0.0), solid.radius, none, None
     if isinstance(solid, kinds.Cuboid):
@@ -220,14 +224,14 @@ def path_poses(path: Keyframes, rotation: tuple[float, ...], at: np.ndarray) -> 
     if not np.abs(turns).max(axis=1).min() > 0:
         raise UserError("path.rotations has a quaternion of length zero")
     turns = _unit(turns)
-    out = np.empty((len(at), 7))
-    for n, t in enumerate(np.clip(at, times[0], times[-1])):
-        i = min(max(bisect.bisect_right(times, t) - 1, 0), max(len(times) - 2, 0))
-        j = min(i + 1, len(times) - 1)
-        f = (t - times[i]) / (times[j] - times[i]) if j > i else 0.0
-        out[n, :3] = places[i] + f * (places[j] - places[i])
-        out[n, 3:] = slerp(turns[i], turns[j], f)
-    return out
+    inside = np.clip(at, times[0], times[-1])
+    if path.smooth and len(times) > 1:
+        turned = RotationSpline(times, Rotation.from_quat(np.roll(turns, -1, axis=1)))(inside)  # SciPy has the scalar last
+        return np.concatenate([CubicSpline(times, places)(inside), np.roll(turned.as_quat(), 1, axis=1)], axis=1)
+    i = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, max(len(times) - 2, 0))
+    j = np.minimum(i + 1, len(times) - 1)
+    f = ((inside - times[i]) / np.where(j > i, times[j] - times[i], 1.0))[:, None]
+    return np.concatenate([places[i] + f * (places[j] - places[i]), slerp(turns[i], turns[j], f)], axis=1)
 
 
 def _unit(turns: np.ndarray) -> np.ndarray:
@@ -235,13 +239,12 @@ def _unit(turns: np.ndarray) -> np.ndarray:
     return turns / np.linalg.norm(turns, axis=1, keepdims=True)
 
 
-def slerp(a: np.ndarray, b: np.ndarray, f: float) -> np.ndarray:
-    """Return the unit quaternion at the share f of the shorter arc from a to b, (4,)."""
-    b = b if float(a @ b) >= 0 else -b
-    angle = 2 * np.arcsin(min(float(np.linalg.norm(b - a)) / 2, 1.0))
-    if angle == 0:
-        return a
-    return (np.sin((1 - f) * angle) * a + np.sin(f * angle) * b) / np.sin(angle)
+def slerp(a: np.ndarray, b: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """Return the unit quaternions at the shares f (N, 1) of the shorter arcs from a to b, (N, 4)."""
+    b = np.where((a * b).sum(1, keepdims=True) >= 0, b, -b)
+    angle = 2 * np.arcsin(np.minimum(np.linalg.norm(b - a, axis=1, keepdims=True) / 2, 1.0))
+    arc = np.where(angle > 0, np.sin(angle), 1.0)
+    return np.where(angle > 0, (np.sin((1 - f) * angle) * a + np.sin(f * angle) * b) / arc, a)
 
 
 def twists_of(poses: np.ndarray, dt: float) -> np.ndarray:

@@ -91,6 +91,19 @@ class Cylinder(Solid):
         _check(self, radius=self.radius, length=self.length)
 
 
+@dataclass(frozen=True)
+class Grip(Solid):
+    """A frame without a shape, which nothing touches: particles that an `Attachment` holds to it move with it, and pull at it.
+
+    The clamp of a testing machine, the hand of a robot: its motion is a `path`, and its force is in `Frames.forces`.
+    """
+
+    def __post_init__(self) -> None:
+        _check(self)
+        if self.mass is not None:
+            raise UserError("a Grip has a mass; it moves as given: leave `mass` out")
+
+
 @dataclass(frozen=True, eq=False)
 class HeightField(Solid):
     """Ground whose height is given on a regular lattice, bilinear in between; all below it is solid, and nothing beside it.

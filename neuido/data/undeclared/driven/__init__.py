@@ -1,0 +1,1 @@
+"""Made experiments with bodies whose clamps move and measure a force."""
