@@ -51,7 +51,7 @@ ROWS = {
     "silicone-EF30_25T": "strain_stiffening,second_invariant",
     "kawabata-rubber": "second_invariant,strain_stiffening",
     "diani-rubber": "fibre,second_invariant",
-    "fish-relax": "relaxation_spectrum,creep",
+    "fish-relax": "relaxation_spectrum,creep,yield",
     "steel-s2": "nonlinear_backstress,kinematic_hardening",
     "cyclic-steel": "nonlinear_backstress,kinematic_hardening",
     "laos": "creep,hysteresis",
@@ -59,7 +59,7 @@ ROWS = {
     "flow_curve": "herschel_bulkley,power_law",
     "creep": "creep,viscosity_shear",
 }
-"""Material tests, with two effects that each is asked of by the tests; the first is in its answer."""
+"""Material tests, with the effects that each is asked of by the tests; the first is in its answer."""
 BALLS = ("bowling-ball", "golf-ball", "whiffle-ball-1", "volleyball")
 DRAG = "drag_linear,drag_quadratic,added_mass"
 """Bodies of the folder of drops, and the effects that the tests ask of them."""
@@ -166,12 +166,13 @@ def _drop(
     measured: Path, target: Path, body: str, *, origin: float = 0.0, unit: float = 1.0, axis: str = "y", backwards: bool = False,
     every: int = 1, twice: bool = False,
 ) -> Path:  # fmt: skip
+    """Write the folder of all drops, which together tell effects of the surroundings; a repeat is one of `body`."""
     source = measured / "bridge-balls"
     content = yaml.safe_load((source / "track.yaml").read_text())
     target.mkdir()
-    recordings = [r for r in content["recordings"] if r["body"] == body]
+    recordings = content["recordings"]
     if twice:
-        recordings.append({**recordings[0], "name": "again"})
+        recordings.append({**next(r for r in recordings if r["body"] == body), "name": "again"})
     for entry in recordings:
         rows = np.loadtxt(source / entry["file"], delimiter=",", skiprows=1)[::every]
         entry["file"] = f"{entry['name']}.csv"
@@ -180,15 +181,16 @@ def _drop(
         entry["columns"] = {"t": "t_s", axis: "height"}
         entry["scale"] = {axis: unit}
     content["model"]["gravity"] = [-9.81 if a == axis else 0.0 for a in "xyz"]
-    content["bodies"] = {body: content["bodies"][body]}
     content["recordings"] = recordings[::-1] if backwards else recordings
     (target / "track.yaml").write_text(yaml.safe_dump(content))
     return target
 
 
-def problem_of(folder: Path) -> Problem:
-    """Return the problem of a folder that `written` made."""
-    return MaterialProblem(folder) if (folder / "test.yaml").is_file() else track_problems(folder)[0]
+def problem_of(folder: Path, row: str) -> Problem:
+    """Return the problem of a row in a folder that `written` made."""
+    if (folder / "test.yaml").is_file():
+        return MaterialProblem(folder)
+    return next(problem for problem in track_problems(folder) if problem.labels["body"] == row)
 
 
 def answered(problem: Problem, effects: str | None, **options: Any) -> tuple[str, set[str], Any]:
@@ -204,7 +206,7 @@ def _cells(row: str, data_root: Path, folder: Path) -> Mapping[str, str]:
     first: tuple[str, set[str]] | None = None
     for way, options in {"as it is": {}, **ways_of(row)}.items():
         begun = time.process_time()
-        answer, names, found = answered(problem_of(written(data_root, folder / f"{row}-{way}", row, **options)), None)
+        answer, names, found = answered(problem_of(written(data_root, folder / f"{row}-{way}", row, **options), row), None)
         text = f"{answer}: {', '.join(sorted(names))}" if names else answer
         if first is None:
             first = answer, names

@@ -11,6 +11,8 @@ from neuido.errors import UserError
 
 LEAST_STEP = 1e-3
 """Smallest difference step of a slope, in typical steps of a parameter."""
+NOTHING = 1e-9
+"""Change of the predicted share of the misfit that counts as none: such changes are rounding, which other units round otherwise."""
 
 
 def candidate_columns(
@@ -122,6 +124,8 @@ def screen(lab: Laboratory, point: Point, candidates: Sequence[Candidate], floor
                 low, high = (p.lower / start[p.name], p.upper / start[p.name])
                 amount[k] = np.clip(amount[k], min(low, high), max(low, high))
             share_left = float(np.sum((left + B @ amount) ** 2) / max(np.sum(left**2), 1e-300))
+            if abs(share_left - 1.0) < NOTHING:
+                share_left = 1.0  # starts that do nothing keep their order, whatever the rounding
             if c.linear:
                 factor = np.clip(amount, -4.0, 4.0)
                 factor = np.where(np.abs(factor) < 0.2, np.where(factor < 0, -0.2, 0.2), factor)

@@ -13,9 +13,9 @@ KNOWN = {
 """What a ball may lack: drag that a heavy and small one does not show."""
 
 
-def answer_of(folder):
+def answer_of(folder, body):
     """The answer and all effects of its classes; the drag that such a ball has is not excluded where it is not named."""
-    problem = problem_of(folder)
+    problem = problem_of(folder, body)
     answer, names, found = answered(problem, DRAG, most=1)
     ordinary = problem.labels["ordinary"].get("drag_quadratic.k", 0.0)
     assert all(one.up_to is None or one.up_to > ordinary for one in found.power if one.name == "drag_quadratic")
@@ -25,10 +25,10 @@ def answer_of(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("body", KNOWN)
 def test_no_answer_changes(data_root, tmp_path, body):
-    answer, names = answer_of(written(data_root, tmp_path / "plain", body))
+    answer, names = answer_of(written(data_root, tmp_path / "plain", body), body)
     assert names <= KNOWN[body] and bool(names) == bool(KNOWN[body])
     for name, options in ways_of(body).items():
-        again, same = answer_of(written(data_root, tmp_path / name, body, **options))
+        again, same = answer_of(written(data_root, tmp_path / name, body, **options), body)
         if name in FEWER:
             assert bool(same) == bool(names) and same <= KNOWN[body], name
         else:

@@ -186,3 +186,24 @@ def test_what_relaxes_stiffens_a_fast_test(tmp_path):
     (young,) = problem.declared
     point = {"young": 5e3, "maxwell.ratio": 50.0, "maxwell.time": 1.0}
     assert problem.shown(point, young) == pytest.approx((5e3, 51 * 5e3)) and problem.shown({"young": 5e3}, young) == (5e3, 5e3)
+
+
+def test_the_order_of_rates_says_nothing(tmp_path):
+    """Rows of a flow curve stand by themselves: in any order the same ones are early, and the last ones validate."""
+    rates = np.geomspace(0.01, 10.0, 20)
+    order = np.random.default_rng(0).permutation(20)
+    found = []
+    for name, rows in (("a", np.arange(20)), ("b", order)):
+        folder = tmp_path / name
+        folder.mkdir()
+        table = np.stack([rates, 2.0 * rates**0.5 + 1.0], axis=1)[rows]
+        np.savetxt(folder / "curve.csv", table, delimiter=",", header="rate,stress", comments="")
+        entry = {"name": "curve", "file": "curve.csv", "mode": "flow_curve", "role": "fit",
+                 "columns": {"shear_rate": "rate", "shear_stress": "stress"}}  # fmt: skip
+        model = {"density": 1000.0, "flow": {"law": "newtonian", "viscosity": 1.0}, "free": ["viscosity"]}
+        content = {"format": "neuido-material-test/1", "name": name, "model": model, "tests": [entry]}
+        (folder / "test.yaml").write_text(yaml.safe_dump(content))
+        (own,) = MaterialProblem(folder).recordings
+        found.append((own.times[np.argsort(rows)], own.noise))
+    np.testing.assert_array_equal(*(times for times, _ in found))
+    assert found[0][1] == pytest.approx(found[1][1], rel=1e-9)
