@@ -8,6 +8,7 @@ import yaml
 
 from neuido.data.measured.material_test import read_material_tests
 from neuido.discrepancy.problems.specimens.material import MaterialProblem
+from neuido.discrepancy.problems.specimens.repeats import are_repeats, mean_rate, scatter, shows_time
 from neuido.errors import UserError
 
 SOLID = {"density": 1000.0, "elasticity": {"law": "neo_hookean", "young": 3e5, "poisson": 0.499}, "plasticity": {"law": "identity"},
@@ -207,3 +208,21 @@ def test_the_order_of_rates_says_nothing(tmp_path):
         found.append((own.times[np.argsort(rows)], own.noise))
     np.testing.assert_array_equal(*(times for times, _ in found))
     assert found[0][1] == pytest.approx(found[1][1], rel=1e-9)
+
+
+def test_ramps_of_another_speed_are_no_repeats_though_both_are_held(tmp_path):
+    """The hold is no part of the loading: else what the rate does to a relaxing rubber would count as scatter of specimens."""
+    t = np.concatenate([np.linspace(0.0, 1.0, 11), 1.0 + np.geomspace(0.05, 1000.0, 40)])
+    rise = np.minimum(t, 1.0)
+    tests = []
+    for name, ramp in (("fast", 0.05), ("slow", 1.0)):
+        table = np.stack([ramp * rise + np.maximum(t - 1.0, 0.0), 1.0 + 0.3 * rise, 1e5 * rise * (1 + 0.2 * (t / ramp + 1) ** -0.3)], 1)
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header="t,l,s", comments="")
+        tests.append({"name": name, "file": f"{name}.csv", "mode": "uniaxial", "role": "fit",
+                      "columns": {"time": "t", "stretch": "l", "nominal_stress": "s"}})  # fmt: skip
+    content = {"format": "neuido-material-test/1", "name": "ramps", "model": SOLID, "tests": tests}
+    (tmp_path / "test.yaml").write_text(yaml.safe_dump(content))
+    found = read_material_tests(tmp_path)
+    assert [mean_rate(test) for test in found.tests] == pytest.approx([np.log(1.3) / 0.05, np.log(1.3)], rel=1e-3)
+    assert not are_repeats(*found.tests) and not scatter(found)
+    assert shows_time(found.tests)

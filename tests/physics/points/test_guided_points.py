@@ -119,3 +119,56 @@ def test_a_long_motion_is_within_a_limit(monkeypatch):
         along(np.array([0.0, 100.0]), 0.0, 0.0, Forces(), 0.01)
     with pytest.raises(UserError, match="increase"):
         along(np.array([1.0, 0.5]), 0.0, 0.0, Forces(), 0.1)
+
+
+def slope(one, value, h=1e-4):
+    """The derivative of a motion by a parameter, by a central difference as in a fit."""
+    return (one(value + h) - one(value - h)) / (2 * h)
+
+
+def test_slopes_of_lift_force_near_a_place_and_buoyancy_are_those_of_the_closed_forms():
+    t = np.linspace(0.0, 0.5, 6)
+    v, tilt, k = 6.0, 0.4, 0.3
+    normal = np.array([-math.sin(tilt), math.cos(tilt), 0.0])
+
+    def thrown(**more):
+        return fly(t, np.zeros((1, 3)), np.array([[v, 0.0, 0.0]]), NOW, Forces(gravity=STILL, **more), step=1e-3)[0]
+
+    def heading(k):
+        return tilt - 2 * np.arctan(np.tan(tilt / 2) * np.exp(-k * v * t))
+
+    by_lift = slope(lambda k: thrown(lift=k, disc_normal=normal), k)
+    courses = [np.stack([np.cos(heading(k + s * 1e-4)), np.sin(heading(k + s * 1e-4))], 1) for s in (1, -1)]
+    of_speed = v * (courses[0] - courses[1]) / 2e-4
+    np.testing.assert_allclose(np.gradient(by_lift[:, 0], t)[1:-1], of_speed[1:-1, 0], atol=0.1 * np.abs(of_speed).max())
+    np.testing.assert_allclose(np.gradient(by_lift[:, 1], t)[1:-1], of_speed[1:-1, 1], atol=0.1 * np.abs(of_speed).max())
+
+    start, w = 0.1, 0.2  # from rest close to the place: r exp((1 - r^2)/2) is r exp(1/2), so that the place is a spring
+    small = 1e-3 * start
+    swing = slope(lambda a0: along(t, small, 0.0, Forces(gravity=STILL, local_force=a0, local_centre=STILL, local_width=w), 1e-3), 3.0)
+    rate = math.sqrt(3.0 * math.exp(0.5) / w)
+    np.testing.assert_allclose(swing, -small * t * rate / (2 * 3.0) * np.sin(rate * t), atol=1e-6 * start)
+
+    def fall(q):
+        moved = Forces(gravity=np.array([0.0, -9.81 * (1 - q), 0.0]), added_mass=0.5 * q)
+        return fly(t, np.zeros((1, 3)), np.zeros((1, 3)), NOW, moved, step=1e-3)[0, :, 1]
+
+    q = 0.4  # a = g (1 - q)/(1 + q/2)
+    np.testing.assert_allclose(fall(q), -9.81 * (1 - q) / (1 + q / 2) * t**2 / 2, atol=1e-9)
+    np.testing.assert_allclose(slope(fall, q), 9.81 * 1.5 / (1 + q / 2) ** 2 * t**2 / 2, rtol=1e-5, atol=1e-12)
+
+
+def test_slopes_of_a_bounce_are_those_of_the_closed_forms():
+    fall, e, after = math.sqrt(2 / 9.81), 0.8, 0.1
+    t, speed = np.array([fall + after]), math.sqrt(2 * 9.81)
+
+    def x(mu):
+        return bounced(t, e, velocity=(2.0, 0.0, 0.0), bounce_friction=mu, roundness=0.4)[:, 0]
+
+    np.testing.assert_allclose(slope(x, 0.05), -(1 + e) * speed * after, rtol=1e-5)
+    np.testing.assert_allclose(slope(x, 1.0), 0.0, atol=1e-9)  # it rolls, whatever the friction
+
+    def y(p):
+        return bounced(t, e, restitution_speed=p)[:, 1]
+
+    np.testing.assert_allclose(slope(y, 0.25), -e * speed * speed**-0.25 * math.log(speed) * after, rtol=1e-5)

@@ -160,18 +160,27 @@ def test_both_engines_compute_the_same(law, mode):
             np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6 * np.abs(b).max())
 
 
-def test_derivatives_of_every_parameter_are_those_of_differences():
+SOFT = ("mullins", "permanent_set", "compaction", "fractional")
+GROUPS = {
+    "yields": {name: value for name, value in EVERYTHING.items() if "viscosity" not in name},
+    "creeps": {name: value for name, value in EVERYTHING.items() if name.partition(".")[0] in SOFT}
+    | {"creep.rate": 0.05, "creep.exponent": 2.0, "creep.stress": 2e4},
+    "relaxes": {f"relaxation_spectrum.g{i}": 0.1 * i for i in range(1, 6)}
+    | {"relaxation_spectrum.first": 0.05, "relaxation_spectrum.last": 20.0, "hysteresis.eta": 0.2},
+    "relaxes once": {"maxwell.ratio": 0.4, "maxwell.time": 0.3, "viscosity_shear.eta": 500.0, "viscosity_bulk.zeta": 300.0},
+}
+"""Parameters that are differentiated together."""
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_derivatives_of_every_parameter_are_those_of_differences(group):
     torch.manual_seed(0)
-    names = [name for name in EVERYTHING if "viscosity" not in name] + ["creep.rate"]
+    names = list(GROUPS[group])
     C = 0.3 * torch.randn(4, 3, 3, dtype=torch.float64)
 
-    def total(values: torch.Tensor, creeps: bool) -> torch.Tensor:
-        given = dict(zip(names, values, strict=True))
-        rate = given.pop("creep.rate")
-        if creeps:
-            given = {k: v for k, v in given.items() if k.partition(".")[0] in ("mullins", "permanent_set", "compaction", "fractional")}
-            given |= {"creep.rate": rate, "creep.exponent": 2.0, "creep.stress": 2e4}
-        specimen = Specimen(NeoHookean(YOUNG, 0.3), None if creeps else VonMises(2e4, YOUNG, 0.3), Effects.of(given), 4)
+    def total(values: torch.Tensor) -> torch.Tensor:
+        effects = Effects.of(dict(zip(names, values, strict=True)))
+        specimen = Specimen(NeoHookean(YOUNG, 0.3), VonMises(2e4, YOUNG, 0.3) if group == "yields" else None, effects, 4)
         law = specimen.law()
         F, history = torch.eye(3, dtype=torch.float64).expand(4, 3, 3), law.start()
         out = torch.zeros((), dtype=torch.float64)
@@ -181,14 +190,26 @@ def test_derivatives_of_every_parameter_are_those_of_differences():
             out = out + (law.stress(F, step, history, 0.2 * i) * torch.linspace(0.5, 1.5, 9, dtype=torch.float64).reshape(3, 3)).sum()
         return out / 1e4
 
-    start = torch.tensor([EVERYTHING.get(name, 0.05) for name in names], dtype=torch.float64)
-    for creeps in (False, True):
-        values = start.clone().requires_grad_()
-        (grad,) = torch.autograd.grad(total(values, creeps), values)
-        for i, name in enumerate(names):
-            h = 1e-5 * float(start[i].abs())
-            ends = [float(total(start + sign * h * torch.eye(len(names), dtype=torch.float64)[i], creeps)) for sign in (1, -1)]
-            assert float(grad[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-4, abs=1e-6 / float(start[i].abs())), name
+    start = torch.tensor(list(GROUPS[group].values()), dtype=torch.float64)
+    values = start.clone().requires_grad_()
+    (grad,) = torch.autograd.grad(total(values), values)
+    for i, name in enumerate(names):
+        h = 1e-5 * float(start[i].abs())
+        ends = [float(total(start + sign * h * torch.eye(len(names), dtype=torch.float64)[i])) for sign in (1, -1)]
+        assert float(grad[i]) == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=2e-4, abs=1e-6 / float(start[i].abs())), name
+        assert float(grad[i]) != 0.0, name
+
+
+def test_slopes_of_the_moduli_by_a_spectrum():
+    """dG'/dg = mu (w T)^2 / (1 + (w T)^2) and dG''/dg = mu w T / (1 + (w T)^2) of a branch."""
+    w, h, T = torch.tensor([0.3, 2.0, 40.0], dtype=torch.float64), 1e-5, np.geomspace(0.05, 20.0, 5)
+    given = {f"relaxation_spectrum__g{i}": 0.2 for i in range(1, 6)}
+    ends = {"relaxation_spectrum__first": 0.05, "relaxation_spectrum__last": 20.0}
+    for i in range(5):
+        name = f"relaxation_spectrum__g{i + 1}"
+        high, low = (complex_modulus(rubber(**(given | {name: 0.2 + sign * h}), **ends), w)[0].numpy() for sign in (1, -1))
+        x = w.numpy() * T[i]
+        np.testing.assert_allclose((high - low) / (2 * h), MU * np.stack([x**2, x], 1) / (1 + x**2)[:, None], rtol=1e-6)
 
 
 def test_a_body_refuses_what_only_a_material_point_has():

@@ -98,8 +98,19 @@ def mean_rate(test: MaterialTest) -> float:
 def _first_loading(test: MaterialTest) -> int:
     """Return the number of rows before a path turns back or rests for the first time."""
     e = strain_of(test)
-    first = monotone_pieces(e)[0]
-    return max(first.stop or len(e), 1)
+    stop = max(monotone_pieces(e)[0].stop or len(e), 1)
+    if test.time is None:
+        return stop
+    rests = np.convolve(_holds(test), np.ones(LEAST_ROWS), "valid") == LEAST_ROWS  # from this step on
+    return min(stop, int(rests.argmax()) + 1) if rests.any() else stop
+
+
+def _holds(test: MaterialTest) -> np.ndarray:
+    """Return whether each step of a path in time holds a large strain, (n - 1,)."""
+    e = strain_of(test)
+    size = np.abs(e).max(axis=1)
+    speed = np.abs(np.diff(e, axis=0)).max(axis=1) / np.diff(test.time)  # type: ignore[arg-type]
+    return (speed < RESTS * speed.max()) & (size[1:] > STRAINED * size.max())
 
 
 def scatter(tests: MaterialTests) -> dict[int, float]:
@@ -185,11 +196,7 @@ def shows_time(tests: Sequence[MaterialTest]) -> bool:
     if any(t.mode == "oscillation" for t in tests) or any(t.control == "stress" for t in timed):
         return True
     for test in timed:
-        e = strain_of(test)
-        size = np.abs(e).max(axis=1)
-        speed = np.abs(np.diff(e, axis=0)).max(axis=1) / np.diff(test.time)  # type: ignore[arg-type]
-        held = (speed < RESTS * speed.max()) & (size[1:] > STRAINED * size.max())
-        if held.sum() >= LEAST_ROWS or turns_back(test):
+        if _holds(test).sum() >= LEAST_ROWS or turns_back(test):
             return True
     for i, a in enumerate(timed):
         for b in timed[:i]:
