@@ -269,7 +269,7 @@ class Keyframes:
         times: Rising times [s], (N,).
         positions: [m], (N, 3).
         rotations: Unit quaternions (w, x, y, z), (N, 4); None: the rotation of the collider throughout.
-        smooth: Cubic splines through the poses in place of straight lines, for measured poses: their velocity has no jumps.
+        smooth: Cubic curves through the poses in place of straight lines, for measured poses: their velocity has no jumps.
     """
 
     times: tuple[float, ...]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neuido.data.undeclared import curves, guided_tracks, laboratory_tests
-from neuido.data.undeclared.driven.driven_bodies import DRIVEN
+from neuido.data.undeclared.driven_bodies import DRIVEN
 from neuido.physics.effects.library import LIBRARY
 from neuido.physics.effects.point_library import POINT_ENTRIES
 from tests.discrepancy.library_coverage import ENTRIES

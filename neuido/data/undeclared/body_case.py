@@ -19,16 +19,22 @@ from neuido.data.undeclared.random_effects import (
     ELASTIC,
     GRAINS,
     KINDS,
+    MAX_SEPARATION,
+    MIN_SEPARATION,
     OUTSIDE,
+    OVER_FLOOR,
     PLASTIC,
     SOLID,
     Drawn,
     Kind,
+    Redraw,
     Scales,
     draw_effect,
+    rms,
+    rounded_to_4,
+    scale_to_separation,
     truth_entry,
 )
-from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, OVER_FLOOR, Redraw, rms, rounded_to_4, scale_to_separation
 from neuido.errors import UserError
 from neuido.types import Body
 

@@ -9,8 +9,7 @@ import yaml
 
 from neuido.data.files.writing import write_text
 from neuido.data.measured.material_test import read_material_tests
-from neuido.data.undeclared.random_effects import Drawn
-from neuido.data.undeclared.sizing import rms, rounded_to_4, scale_to_separation
+from neuido.data.undeclared.random_effects import Drawn, rms, rounded_to_4, scale_to_separation
 
 Sizes = Mapping[str, tuple[Mapping[str, float], str, float, float]]
 """For each effect: initial values, names of the parameters to scale, and the smallest and largest scale factor."""

@@ -15,8 +15,7 @@ from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curve_files import PAIR, Sizes, drawn_effects, key_rows, outside_entry, values_of, write_csv, write_tests
 from neuido.data.undeclared.laboratory_tests import form_of
-from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, truth_entry
-from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4
+from neuido.data.undeclared.random_effects import ELASTIC, PLASTIC, Drawn, Redraw, rms, rounded_to_4, truth_entry
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material

@@ -13,8 +13,7 @@ from neuido.data.files.writing import write_text
 from neuido.data.measured.track import read_tracks
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curve_files import PAIR, drawn_effects, values_of
-from neuido.data.undeclared.random_effects import Drawn
-from neuido.data.undeclared.sizing import rms, rounded_to_4
+from neuido.data.undeclared.random_effects import Drawn, rms, rounded_to_4
 from neuido.errors import UserError
 from neuido.physics.effects.library import LIBRARY
 from neuido.physics.points.point_mass import Forces, fly

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from neuido.data.undeclared.curve_files import Sizes, drawn_effect, key_rows, write_tests
-from neuido.data.undeclared.random_effects import ELASTIC, truth_entry
-from neuido.data.undeclared.sizing import Redraw, rms, rounded_to_4
+from neuido.data.undeclared.random_effects import ELASTIC, Redraw, rms, rounded_to_4, truth_entry
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.effects.point_library import FLUID
 from neuido.physics.laws.classical import material

@@ -17,10 +17,9 @@ from neuido.data.progress import Progress
 from neuido.data.undeclared.body_case import SOLVERS, body_case
 from neuido.data.undeclared.case import Case
 from neuido.data.undeclared.curves import TEST_OUTSIDE, curve_case
-from neuido.data.undeclared.driven.driven_bodies import driven_case
+from neuido.data.undeclared.driven_bodies import driven_case
 from neuido.data.undeclared.guided_tracks import guided_case
-from neuido.data.undeclared.random_effects import KINDS, OUTSIDE
-from neuido.data.undeclared.sizing import MAX_SEPARATION, MIN_SEPARATION, Redraw
+from neuido.data.undeclared.random_effects import KINDS, MAX_SEPARATION, MIN_SEPARATION, OUTSIDE, Redraw
 from neuido.errors import UserError
 from neuido.physics.effects.point_library import POINT_ENTRIES
 from neuido.physics.runtime.device import choose_device

@@ -7,7 +7,7 @@ ten times the inner steps.
 
 import bisect
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ STRESSES = frozenset({
     "viscosity_shear",
 })  # fmt: skip
 """Effects that add to the stress and have no history."""
+PATH_SCALE = "path_scale"
+"""Name of a nuisance: relative error of the measured path of the clamps of a recording."""
 INNER_STEPS = sorted({factor << k for factor in (1, 3) for k in range(11)})
 """Numbers of inner steps that finite elements take: few enough that motions of about the same need share launches and captured loops."""
 
@@ -113,3 +115,18 @@ def pushes_of(frames: Frames, scenes: Sequence[int], clamps: int) -> Pushes:
         own = [each.force for each in frames.colliders if each.scene == s and each.force is not None][-clamps:]
         out.append(-step * torch.stack(own, dim=1).cumsum(dim=0).cpu().numpy())
     return Pushes(step * np.arange(len(frames.x)), np.stack(out))
+
+
+def scaled_paths(simulator: Any, steps: int, points: Sequence[tuple[Mapping[str, float], str]]) -> dict[str, Any]:
+    """Return the argument `solids` of a rollout in which the clamps move by their path times its nuisance; empty where none has one.
+
+    Args:
+        simulator: The simulator.
+        steps: Substeps of the rollout.
+        points: Parameter set, and name of the recording, of each scene.
+    """
+    scale = [point.get(f"{PATH_SCALE}:{name}", 0.0) for point, name in points]
+    if not any(scale):
+        return {}
+    own = simulator.solid_inputs(steps)
+    return {"solids": own._replace(twist=own.twist * (1.0 + own.twist.new_tensor(scale))[:, None, None])}

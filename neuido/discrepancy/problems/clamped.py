@@ -16,9 +16,9 @@ from neuido.data.measured.experiment import Experiment
 from neuido.data.measured.experiment import Recording as Measured
 from neuido.discrepancy.problems import noise
 from neuido.discrepancy.problems.body import WINDOWS, BodyProblem, Run, body_problem
-from neuido.discrepancy.problems.body_launches import Pushes
+from neuido.discrepancy.problems.body_launches import PATH_SCALE, Pushes
 from neuido.discrepancy.problems.problem import Parameter, Point, Recording
-from neuido.discrepancy.problems.rollouts import PATH_SCALE, Motions
+from neuido.discrepancy.problems.rollouts import Motions
 from neuido.discrepancy.problems.settings import SETTINGS
 from neuido.errors import UserError
 

@@ -48,9 +48,6 @@ LEAST_LIFT, MOST_LIFT, GAP = 0.05, 0.8, 1.0
 """Contact height [suggested cells]: its least change, its largest distance from the declared height, and the least gap at the start between
 body and colliders with which it may change."""
 
-PATH_SCALE = "path_scale"
-"""Name of a nuisance: relative error of the measured path of the clamps of a recording."""
-
 Motions = tuple[Sequence[Point], int]
 """Parameter sets, and the number of the recording that is simulated with each of them."""
 
@@ -175,10 +172,7 @@ class BodyRollouts(Problem):
         steps = segment * math.ceil(steps / segment)  # on a GPU, what is captured for whole motions serves early ones too
         given = {"state": self._start(simulator, full, [n for _, n in runs], lifts), "effects": effects}
         given |= {"every": every, "segment": segment}
-        if any(name.startswith(PATH_SCALE) for point, _ in filled for name in point):
-            scale = [1.0 + point.get(f"{PATH_SCALE}:{self.measured[n].name}", 0.0) for point, n in filled]
-            own = simulator.solid_inputs(steps)
-            given["solids"] = own._replace(twist=own.twist * own.twist.new_tensor(scale)[:, None, None])
+        given |= body_launches.scaled_paths(simulator, steps, [(point, self.measured[n].name) for point, n in filled])
         elements = EVERY[setting].solver == "finite_elements"
         if elements and len(inner := {self.inner_steps(point, setting) for points, _ in runs for point in points}) == 1 and any(inner):
             given["inner"] = inner.pop()

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 from torch import Tensor
 
 from neuido.errors import UserError
@@ -225,13 +223,22 @@ def path_poses(path: Keyframes, rotation: tuple[float, ...], at: np.ndarray) -> 
         raise UserError("path.rotations has a quaternion of length zero")
     turns = _unit(turns)
     inside = np.clip(at, times[0], times[-1])
-    if path.smooth and len(times) > 1:
-        turned = RotationSpline(times, Rotation.from_quat(np.roll(turns, -1, axis=1)))(inside)  # SciPy has the scalar last
-        return np.concatenate([CubicSpline(times, places)(inside), np.roll(turned.as_quat(), 1, axis=1)], axis=1)
     i = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, max(len(times) - 2, 0))
     j = np.minimum(i + 1, len(times) - 1)
     f = ((inside - times[i]) / np.where(j > i, times[j] - times[i], 1.0))[:, None]
+    if path.smooth and len(times) > 1:
+        flips = np.concatenate([[1.0], np.cumprod(np.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0))])
+        poses = np.concatenate([places, flips[:, None] * turns], axis=1)
+        found = _cubic(times, poses, i, f)
+        return np.concatenate([found[:, :3], _unit(found[:, 3:])], axis=1)
     return np.concatenate([places[i] + f * (places[j] - places[i]), slerp(turns[i], turns[j], f)], axis=1)
+
+
+def _cubic(times: np.ndarray, values: np.ndarray, i: np.ndarray, f: np.ndarray) -> np.ndarray:
+    """Return cubic Hermite curves through values (N, k) at the shares f (n, 1) of the intervals i (n,); slopes are central differences."""
+    slopes = np.gradient(values, times, axis=0, edge_order=min(2, len(times) - 1))
+    h, g = np.diff(times)[i][:, None], 1 - f
+    return (1 + 2 * f) * g**2 * values[i] + f * g**2 * h * slopes[i] + f**2 * (3 - 2 * f) * values[i + 1] - f**2 * g * h * slopes[i + 1]
 
 
 def _unit(turns: np.ndarray) -> np.ndarray:

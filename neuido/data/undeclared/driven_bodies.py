@@ -12,8 +12,17 @@ import torch
 from neuido.data.measured.clamps import Clamp, MeasuredForce
 from neuido.data.measured.experiment import Experiment, Recording, read_experiment, write_experiment
 from neuido.data.undeclared.case import Case
-from neuido.data.undeclared.random_effects import ELASTIC, Scales, draw_effect, truth_entry
-from neuido.data.undeclared.sizing import MIN_SEPARATION, Redraw, rms, rounded_to_4, scale_to_separation
+from neuido.data.undeclared.random_effects import (
+    ELASTIC,
+    MIN_SEPARATION,
+    Redraw,
+    Scales,
+    draw_effect,
+    rms,
+    rounded_to_4,
+    scale_to_separation,
+    truth_entry,
+)
 from neuido.errors import UserError
 from neuido.physics.effects.parameters import Effects
 from neuido.physics.laws.classical import material

@@ -1,1 +1,0 @@
-"""Made experiments with bodies whose clamps move and measure a force."""
