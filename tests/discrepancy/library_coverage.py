@@ -121,14 +121,24 @@ ENTRIES = (
 )  # fmt: skip
 
 
-def table() -> str:
-    """Return the table as Markdown."""
+INTRODUCTION = """# Diagnosis: what laboratories measure, key by key
+
+Each effect and kind of data that a laboratory needs, with the test that holds its closed form or a refined computation, the test of its
+derivatives (of points and flow curves: of the slopes that a fit takes by differences), and the made cases of `neuido undeclared` or, of
+kinds of test, the form of `neuido/data/undeclared/laboratory_tests.py` that draws them. `tests/discrepancy/test_library_coverage.py` holds
+that all of them exist.
+
+"""
+
+
+def page() -> str:
+    """Return the table with its heading, as Markdown."""
     lines = ["| group | what | in the library | closed form or refined computation | gradient or slopes | made cases |", "| --- " * 6 + "|"]
     for own in ENTRIES:
         case = own.measured if "::" in own.measured else f"{own.measured}, {own.kind}"
         cells = [own.group, own.what, own.name, *(_short(test) for test in (own.closed, own.gradient)), _short(case)]
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return INTRODUCTION + "\n".join(lines) + "\n"
 
 
 def _short(test: str) -> str:
@@ -139,4 +149,4 @@ def _short(test: str) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Write the table of what laboratories measure, with the tests of each entry.")
     parser.add_argument("--out", type=Path, required=True)
-    write_text(parser.parse_args().out, table())
+    write_text(parser.parse_args().out, page())

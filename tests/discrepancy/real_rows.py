@@ -219,6 +219,16 @@ def _cells(row: str, data_root: Path, folder: Path) -> Mapping[str, str]:
     return out
 
 
+INTRODUCTION = """# Diagnosis: real rows in other ways
+
+Each row is diagnosed with all effects that its kind of test could show, as it is and written in other ways: the clock starts at 1.7e6 s, the
+unit is a thousandth or a thousandfold, axes change their names, tests or recordings come in reverse order, rows without an order are
+permuted, every second row is left out, a test is given twice. `same`: the same answer with the same effects in its classes. `within`: an
+answer of the same kind with no effect that was not in the classes before. Seconds are of the processor.
+
+"""
+
+
 def _main() -> None:
     parser = argparse.ArgumentParser(description="Diagnose real rows in ways that should change no answer, and write the table.")
     parser.add_argument("--out", type=Path, required=True)
@@ -232,7 +242,7 @@ def _main() -> None:
             cells = _cells(row, data_root, Path(folder))
             lines.append(f"| {row} | " + " | ".join(cells.get(name, "") for name in columns) + " |")
             print(lines[-1], file=sys.stderr, flush=True)
-            write_text(given.out, "\n".join(lines) + "\n")
+            write_text(given.out, INTRODUCTION + "\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from neuido.data.undeclared import curves, guided_tracks, laboratory_tests
 from neuido.data.undeclared.driven_bodies import DRIVEN
 from neuido.physics.effects.library import LIBRARY
 from neuido.physics.effects.point_library import POINT_ENTRIES
-from tests.discrepancy.library_coverage import ENTRIES
+from tests.discrepancy.library_coverage import ENTRIES, page
 
 TESTS = Path(__file__).parents[1]
 FORMS = ("creep_test", "oscillation", "fluid_curves", "held_ramps", "periodic_cycles", "repeated_specimens")
@@ -33,6 +33,11 @@ def test_every_effect_of_a_specimen_or_a_guided_point_is_in_the_table():
     plane = {"volumetric", "geometric_nonlinearity"}  # of plane specimens, whose tests are their own
     assert {entry.name for entry in POINT_ENTRIES} - plane <= named
     assert named & {entry.name for entry in LIBRARY}
+
+
+def test_the_page_is_that_of_the_script():
+    own = TESTS.parent / "research" / "results" / "loop_library.md"
+    assert own.read_text() == page(), "run python -m tests.discrepancy.library_coverage --out research/results/loop_library.md"
 
 
 @pytest.mark.parametrize(
