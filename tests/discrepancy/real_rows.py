@@ -221,10 +221,10 @@ def _cells(row: str, data_root: Path, folder: Path) -> Mapping[str, str]:
 
 INTRODUCTION = """# Diagnosis: real rows in other ways
 
-Each row is diagnosed with all effects that its kind of test could show, as it is and written in other ways: the clock starts at 1.7e6 s, the
-unit is a thousandth or a thousandfold, axes change their names, tests or recordings come in reverse order, rows without an order are
+Each row is diagnosed with all effects that its kind of test could show, as it is and written in other ways: the clock starts at 1.7e6 s,
+the unit is a thousandth or a thousandfold, axes change their names, tests or recordings come in reverse order, rows without an order are
 permuted, every second row is left out, a test is given twice. `same`: the same answer with the same effects in its classes. `within`: an
-answer of the same kind with no effect that was not in the classes before. Seconds are of the processor.
+answer of the same kind whose effects were in the classes before. Seconds are of the processor.
 
 """
 
