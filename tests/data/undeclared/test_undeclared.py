@@ -16,6 +16,7 @@ from neuido.data.undeclared import random_bodies as bodies
 from neuido.data.undeclared.body_case import draw_kinds
 from neuido.data.undeclared.guided_tracks import KINDS as GUIDED
 from neuido.data.undeclared.instruments import WRONG_NUISANCES
+from neuido.data.undeclared.laboratory_tests import creep_test, fluid_curves, form_of, held_ramps, oscillation
 from neuido.data.undeclared.motion import Motion, Solver, simulate_motion
 from neuido.data.undeclared.random_effects import KINDS, OUTSIDE, Scales, draw_effect, truth_entry
 from neuido.errors import UserError
@@ -266,16 +267,11 @@ def test_density_gradient_turns_a_thrown_body_about_another_centre():
 # Curves.
 
 
-def test_kinds_of_test(tmp_path):
-    """A relaxation may be shown by an oscillation, and a creep test prescribes the stress."""
-    modes = set()
-    for seed in range(6):
-        make_undeclared(
-            seed, str(tmp_path / f"{seed}"), case=Case(measured="material_test", kind="fractional"), device="cpu", progress=False
-        )
-        test = yaml.safe_load((tmp_path / f"{seed}" / "test.yaml").read_text())["tests"][0]
-        modes.add(test.get("control") or ("oscillation" if test["mode"] == "oscillation" else "path"))
-    assert modes == {"stress", "oscillation", "path"}
+def test_kinds_of_test():
+    """A relaxation may be shown by a path, an oscillation, a creep test or a ramp that is held; a flow law by flow curves alone."""
+    drawn = {kind: {form_of(np.random.default_rng(seed), kind) for seed in range(60)} for kind in ("fractional", "thixotropy")}
+    assert drawn["fractional"] == {None, oscillation, creep_test, held_ramps}
+    assert drawn["thixotropy"] == {fluid_curves}
 
 
 @pytest.mark.parametrize(
