@@ -16,6 +16,9 @@ from neuido.discrepancy.problems.problem import Parameter, Point
 FOLLOWED = 1.5
 """Factor by which the error of the declared model must fall before an extra parameter of the problem (such as the height of the
 colliders) may leave its first value."""
+DOUBLINGS = 5
+"""Doublings and halvings of a declared value that the fit of the declared model looks at before it begins: a modulus that is only guessed
+may be wrong by a factor of ten."""
 AGAIN, MOST_AGAIN = 2, 4
 """Least and largest number of fits of the declared model, each with the differences of the settings at the end of the fit before. More
 than the least are made only while an extra parameter of the problem still changes."""
@@ -108,13 +111,21 @@ def grown(
     return ended
 
 
-def scaled_starts(lab: Laboratory, point: Point) -> list[Point]:
-    """Return the point, and copies of it with each log-scaled declared parameter halved and doubled."""
-    out: list[Point] = [dict(point)]
+def scaled_starts(lab: Laboratory, floor: Floor) -> list[Point]:
+    """Return the declared values, and copies of them with each log-scaled declared parameter scaled.
+
+    Each parameter is halved and doubled. It also takes the value in a coarse scan over `DOUBLINGS` that predicts the first horizon best.
+    The motion of a body that is much too stiff hardly depends on its modulus, so that a fit from there would stay there.
+    """
+    out: list[Point] = [{}]
+    first = early(lab, floor, HORIZONS[0])
     for p in lab.problem.declared:
         if p.log:
-            value = point.get(p.name, p.value)
-            out += [dict(point) | {p.name: p.within(value * f)} for f in (0.5, 2.0)]
+            scan = {k: {p.name: p.within(p.value * 2.0**k)} for k in range(-DOUBLINGS, DOUBLINGS + 1)}
+            able = [k for k, point in scan.items() if lab.problem.margin(point, lab.setting) >= 0.0]
+            costs = dict(zip(able, lab.costs([scan[k] for k in able], first), strict=True))
+            best = min(able, key=lambda k: costs[k], default=0)
+            out += [scan[k] for k in (-1, 1, *({best} - {-1, 0, 1}))]
     return out
 
 
@@ -131,8 +142,8 @@ def base_fit(search: Search, near: Point | None = None) -> Stand | None:
     """
     lab = search.lab
     # the first fit only finds the point at which to measure the floor
-    begins = [{}, near] if near else scaled_starts(lab, {})
     with discretisation.quickly(lab):
+        begins = [{}, near] if near else scaled_starts(lab, lab.noise())
         fit = fit_declared(lab, begins, lab.noise(), iterations=6, tolerance=ROUGH)
     if fit.setting != lab.own and not lab.runs(fit.point):
         fit = fit_declared(lab, begins, lab.noise(), iterations=6, tolerance=ROUGH)
