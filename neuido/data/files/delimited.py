@@ -32,6 +32,20 @@ BROKEN, WORD, THOUSANDS = 2.0, 1.5, 0.01
 """What a cell takes from the score of a dialect: a broken number, a word (a name may be a column), and 1.250 read as 1250."""
 BLOCK = "point"
 """Title of the column that names the trajectory of each row, where a file has one trajectory below the other."""
+_RULE = re.compile(r"[\s|+:]*([-=_]{3,}[\s|+:]*)+")
+"""A line that is drawn between titles and numbers."""
+_MINUS = re.compile(r"\u2212(?=[\d.,])")
+_FORTRAN = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+))[dD]([+-]?\d{1,3})")
+"""A number of Fortran: 1.25D+02."""
+_BOOKED = re.compile(r"\((\d+[.,]\d+)\)")
+"""A negative number of a spreadsheet's accounting: (1.25). Without a decimal sign it may be a footnote."""
+ENCODINGS = {
+    "gb18030": ("时间", "位移", "应变", "应力", "变形", "载荷", "试验"),
+    "cp932": ("時間", "変位", "荷重", "ひずみ", "歪", "応力", "試験"),
+    "cp1251": ("время", "нагрузка", "перемещение", "деформация", "напряжение", "усилие", "удлинение"),
+    "cp1250": ("siła", "obciążenie", "naprężenie", "odkształcenie", "wydłużenie"),
+}
+"""Encodings of text that is no UTF-8, each with words that show it; else it is of Western Europe."""
 _SAMPLE = 400
 """Number of lines from which the dialect is detected."""
 
@@ -62,7 +76,11 @@ def read_delimited(path: Path) -> Delimited:
     text, encoding = _decoded(path)
     cells = max(text.count(separator) for separator in ",;\t |") + text.count("\n") + text.count("\r")
     check_limit(cells, "NEUIDO_MAX_TABLE_CELLS", f"{path} has {cells} cells")
-    numbered = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")]
+    numbered = [
+        (i, line)
+        for i, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#") and not _RULE.fullmatch(line)
+    ]
     separator, decimal = _dialect([line for _, line in numbered[-_SAMPLE:]])
     rows, lines = [], []
     for i, line in numbered:
@@ -141,10 +159,7 @@ def _decoded(path: Path) -> tuple[str, str]:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encodings = ["utf-16"]
-    else:
-        encodings = ["utf-8-sig", "cp1252"]
+    encodings = ["utf-16"] if data.startswith((b"\xff\xfe", b"\xfe\xff")) else ["utf-8-sig", *_by_words(data), "cp1252"]
     if b"\0" in data and encodings[0] != "utf-16":
         raise UserError(f"{path} is not a CSV file: it contains zero bytes; convert an Excel sheet with `neuido import`")
     for encoding in encodings:
@@ -153,6 +168,12 @@ def _decoded(path: Path) -> tuple[str, str]:
         except UnicodeDecodeError:
             continue
     raise UserError(f"{path} is not a CSV file: its encoding is none of {', '.join(encodings)}; save it as UTF-8")
+
+
+def _by_words(data: bytes) -> list[str]:
+    """Return the encodings in whose text a word stands that shows them."""
+    start = data[:10_000]
+    return [name for name, words in ENCODINGS.items() if any(word in start.decode(name, errors="replace").lower() for word in words)]
 
 
 def _dialect(lines: list[str]) -> tuple[str, str]:
@@ -184,8 +205,18 @@ def _dialect(lines: list[str]) -> tuple[str, str]:
 
 def _split(line: str, separator: str) -> list[str]:
     if separator == " ":
-        return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, strict=True, skipinitialspace=True))]
+        return [_plain(cell) for cell in line.split()]
+    return [_plain(cell.strip()) for cell in next(csv.reader([line], delimiter=separator, strict=True, skipinitialspace=True))]
+
+
+def _plain(cell: str) -> str:
+    """Rewrite the typographic minus sign, Fortran's exponents and the negative numbers of accounting; return other text unchanged."""
+    if not cell or cell[-1] not in "0123456789).,%":
+        return cell
+    cell = _MINUS.sub("-", cell)
+    if found := _BOOKED.fullmatch(cell):
+        return f"-{found[1]}"
+    return f"{found[1]}e{found[2]}" if (found := _FORTRAN.fullmatch(cell)) else cell
 
 
 def _in_dialect(cell: str, decimal: str) -> bool:

@@ -19,7 +19,7 @@ from neuido.data.importers.machines.material_folder import Material, write_mater
 from neuido.data.importers.machines.testing_machine import Specimen
 from neuido.data.importers.plain_motion import Motion
 from neuido.data.importers.tables.checked_folder import recording_name, roles_of
-from neuido.data.importers.tables.titled_tables import read_cells, read_titled
+from neuido.data.importers.tables.titled_tables import Table, read_cells, read_titled
 from neuido.data.importers.tables.titles import find_columns, named_points
 from neuido.data.importers.tables.units import parse_quantity
 from neuido.data.importers.track_folder import Axes, RecordedMotion, in_si, write_tracks
@@ -319,7 +319,7 @@ def _kind(path: Path, columns: Mapping[str, str]) -> str:
     found = find_columns(table.titles, dict(columns), table.units)
     if {"time", "frame"} & set(found):
         if {"x", "y", "z"} & set(found):
-            return "body" if {"id", "x", "y", "z"} <= set(found) else "track"
+            return "body" if {"id", "x", "y", "z"} <= set(found) and _named_rows(table, found["id"]) > 1 else "track"
         if named_points(table.titles):
             return "track"
         if "angle" in found and not {"force", "displacement", "nominal_stress", "shear_stress"} & set(found):
@@ -327,4 +327,11 @@ def _kind(path: Path, columns: Mapping[str, str]) -> str:
         if "displacement" in found and set(found) <= {"time", "frame", "displacement", "recording", "rate"}:
             unknown = [i for i, title in enumerate(table.titles) if i not in found.values() and np.isfinite(table.data[:, i]).any()]
             return "track" if not unknown else "material"  # an unknown column may be the force
+    elif named_points(table.titles) and not {"force", "nominal_stress", "shear_stress"} & set(found):
+        return "track"
     return "material"
+
+
+def _named_rows(table: Table, column: int) -> int:
+    """Return the number of different entries of a column."""
+    return len({row[column] for row in table.cells if column < len(row) and row[column]})

@@ -77,10 +77,12 @@ def _motion(path: Path, table: Table, found: Mapping[str, int], frame_rate: floa
     angle = not points and "angle" in found
     if angle:
         points = {"": {"x": found["angle"]}}
-    if not points or clock is None:
-        titles = ", ".join(filter(None, table.titles))[:200]
+    if not points or (clock is None and frame_rate is None):
+        titles = ", ".join(filter(None, table.titles))[:150]
+        each = "" if not points else ", or give --frame_rate if each row is a frame"
         raise UserError(
-            f"{path.name} has no time or no position: name their columns with --columns.time TITLE --columns.x TITLE (titles: {titles})"
+            f"{path.name} has no time or no position: name their columns with --columns.time TITLE --columns.x TITLE{each} "
+            f"(titles: {titles})"
         )
     axes = next(iter(points.values()))
     if "z" in axes and "y" not in axes:
@@ -88,10 +90,12 @@ def _motion(path: Path, table: Table, found: Mapping[str, int], frame_rate: floa
         raise UserError(f"{path.name} has z and no y, which points up: give --columns.y {title!r} if {title!r} is the height")
     used = [(name or "", axis, i) for name, own in points.items() for axis, i in own.items()]
     notes = [*table.notes, *(f"column {i + 1} {table.titles[i]!r} -> {f'{name} {axis}'.strip()}" for name, axis, i in
-                             [("", clock, found[clock]), *used])]  # fmt: skip
+                             [*([("", clock, found[clock])] if clock else []), *used])]  # fmt: skip
+    if clock is None:
+        notes.append("no column of time: each row is a frame")
     if not found.keys() & set("xyz") and "displacement" in found and "" in points:
         notes.append("one displacement is taken as horizontal (--columns.y where it points up)")
-    t, timed = _times(path, table, found[clock], clock, frame_rate)
+    t, timed = _times(path, table, found[clock], clock, frame_rate) if clock else (np.arange(len(table.data), dtype=float), False)
     unit, factors = (f"{ANGLE} {table.units[axes['x']]}".strip(), {}) if angle else _unit(path, table, [i for *_, i in used], notes)
     read = {}
     for name, own in points.items():
@@ -100,8 +104,8 @@ def _motion(path: Path, table: Table, found: Mapping[str, int], frame_rate: floa
     ids = _ids(table, found.get("id"), t, next(iter(read.values())), path)
     if ids is None or len(read) > 1:
         seen = {name or _label(path): x for name, x in read.items()}
-        return Motion(t, seen, unit, clock == "frame", notes, timed)
-    return _by_id(path, t, next(iter(read.values())), ids, Motion(t, {}, unit, clock == "frame", notes, timed))
+        return Motion(t, seen, unit, clock != "time", notes, timed)
+    return _by_id(path, t, next(iter(read.values())), ids, Motion(t, {}, unit, clock != "time", notes, timed))
 
 
 def _times(path: Path, table: Table, column: int, clock: str, frame_rate: float | None) -> tuple[np.ndarray, bool]:

@@ -46,6 +46,8 @@ def layout_of_rows(rows: list[list[str]]) -> str:
         return "trc"
     if first and first[0] in VICON:
         return "vicon"
+    if first and first[0] == "no_of_frames":
+        return "qualisys"
     return "deeplabcut" if first and first[0] == "scorer" else ""
 
 
@@ -106,6 +108,24 @@ def _vicon(path: Path, rows: list[list[str]]) -> Motion:
     return Motion((data[:, 0] - data[0, 0]) / float(rows[1][0]), points, unit, False, [f"Vicon, {float(rows[1][0]):g} Hz"])
 
 
+def _qualisys(path: Path, rows: list[list[str]]) -> Motion:
+    """Read an export of Qualisys: its header ends with the names of the markers, and titles may stand below them."""
+    info = {row[0].upper(): row[1:] for row in rows if row[0].isupper()}
+    rate, names = next(iter(info.get("FREQUENCY", [])), ""), [name for name in info.get("MARKER_NAMES", []) if name]
+    if not is_number(rate) or not float(rate) > 0 or not names:
+        raise UserError(f"{path}: an export of Qualisys has FREQUENCY and MARKER_NAMES in its header: export it again")
+    head = next(i for i, row in enumerate(rows) if row[0].upper() == "MARKER_NAMES") + 1
+    titled = head < len(rows) and not is_number(rows[head][0])
+    first, data = _numbers_from(path, rows, head + titled)
+    before = data.shape[1] - 3 * len(names)  # columns of frame and time
+    if before < 0:
+        raise UserError(f"{path}: {len(names)} markers need {3 * len(names)} columns, and there are {data.shape[1]}: export positions (3D)")
+    points = {name: data[:, before + 3 * i : before + 3 * i + 3] for i, name in enumerate(names)}
+    points = {name: np.where((x == 0).all(1, keepdims=True), np.nan, x) for name, x in points.items()}
+    notes = [f"Qualisys, {len(points)} markers, {float(rate):g} Hz, positions in mm"]
+    return Motion(np.arange(len(data)) / float(rate), points, "mm", False, notes)
+
+
 def _deeplabcut(path: Path, rows: list[list[str]]) -> Motion:
     first, data = _numbers_from(path, rows, 3)
     named = [row for row in rows[1 : first - 1] if row[0].lower() in ("individuals", "bodyparts")]
@@ -153,5 +173,5 @@ def _c3d(path: Path) -> Motion:
     return Motion(np.arange(len(x)) / rate, points, unit or "mm", False, [f"C3D, {len(points)} markers, {rate:g} Hz"])
 
 
-LAYOUTS = {"optitrack": _optitrack, "trc": _trc, "vicon": _vicon, "deeplabcut": _deeplabcut}
+LAYOUTS = {"qualisys": _qualisys, "optitrack": _optitrack, "trc": _trc, "vicon": _vicon, "deeplabcut": _deeplabcut}
 """Reader of each layout that is told by the first cells."""

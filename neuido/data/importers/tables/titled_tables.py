@@ -253,7 +253,7 @@ def _under_groups(groups: list[str], titles: list[str], units: list[str]) -> tup
     units = list(units)
     for i, group in enumerate(wide):
         found = UNIT_IN_TITLE.search(group)
-        unit = (found[1] or found[2] or "").strip() if found else ""
+        unit = (found[1] or "").strip() if found else ""  # in brackets: other words above a table may end in a unit too
         if unit and titles[i] and not units[i] and not UNIT_IN_TITLE.search(titles[i]) and is_unit(unit):
             units[i] = unit
     return titles, units

@@ -1,4 +1,4 @@
-"""Recognise the quantity of a column from its title, in English, German, French or Spanish, and the unit that stands in it."""
+"""Recognise the quantity of a column from its title, in English or another language, and the unit that stands in it."""
 
 import re
 import unicodedata
@@ -51,14 +51,20 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "displacement_2": _axis("extension|displacement|elongation", "u", "2", "y"),
     "shear_stress": r"shear stress|schubspannung|tau|contrainte de cisaillement|(esfuerzo|tensi.n) (cortante|de corte|tangencial)",
     "shear": r"shear strain|amount of shear|shear|scherung|gleitung|gamma|γ|cisaillement|distorsi.n",
-    "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ|.*contrainte.*|.*esfuerzo.*|tensión.*",
+    "nominal_stress": r".*stress.*|.*spannung.*|sigma|σ|.*contrainte.*|.*esfuerzo.*|tensión.*|"
+    r"(sforzo|tensione|tensao|spanning|naprezenie)( .*)?|напряжение.*|.*应力|.*応力",
     "stretch": r"(?!.*(force|load|length))stretch.*|streck(ung|grad|verh.ltnis).*|lambda|λ|.longation relative",
-    "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*verformung.*|.*déformation.*|deformación.*",
-    "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f",
-    "displacement": r"(?![xyz][ _-]|pos\w*[ _-]?[xyz]$).*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|"
-    r"verl.ngerung|distance$|position|deflection|compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
-    r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub",
-    "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
+    "strain": r"ne[ _]?(11|xx)|[µμ]ε|.*strain.*|.*dehnung.*|epsilon|ε|.*stauchung.*|.*verformung.*|.*déformation.*|deformación.*|"
+    r"(deformazione|deformacao|rek|vervorming|tojning|odkszta[łl]cenie)( .*)?|(относительная )?деформация.*|.*应变|.*ひずみ|.*歪み?",
+    "force": r"(?!.*(cell|rate|step)).*(force|load|kraft|effort|fuerza|carga|charge).*|f|"
+    r"(forza|carico|forca|kracht|belasting|si[łl]a|obciazenie)( .*)?|(нагрузка|усилие|сила).*|.*(载荷|荷载|负荷|荷重)|(试验)?力",
+    "displacement": r"(?![xyz][ _-]|(.*\.)?pos\w*[ ._-]?[xyz]$)"
+    r".*(extension|displacement|crosshead|stroke|elongation|gap change|travel|traverse|verl.ngerung|distance$|position|deflection|"
+    r"compression|deformation).*|.*(standard|pr.f|traversen)?weg|"
+    r"allongement|.*d.placement.*|course.*|enfoncement|.crasement|fl.che|desplazamiento.*|alargamiento|carrera|maschinenhub|"
+    r"(spostamento|corsa|allungamento|deslocamento|alongamento|verplaatsing|forskjutning|przemieszczenie|wyd[łl]uzenie)( .*)?|"
+    r"(перемещение|удлинение).*|.*(位移|变形|伸长|変位)|伸び|ストローク",
+    "time": r".*time.*|.*zeit.*|t|temps.*|tiempo.*|tempo|tijd|czas|время|.*时间|.*時間|(elapsed )?(sec|second|sekunde|seconde|segundo)s?n?",
     "frame": r"frames?( ?#)?|frame[ _]?(idx|index|no\.?|nr\.?|number|id)|"
     r"(video )?bild(nummer|nr)?|image( ?(no|nr|number)\.?)?|slice|trame|fotograma|index|idx",
     "recording": r"recording|take|trial|run|experiment|clip|video|sequence|throw|"
@@ -70,7 +76,7 @@ MEANINGS = {  # quantity: pattern of its title; the first match counts
     "y": _place("y") + r"|h|height\w*|h.he|hauteur|altura|ordonn.e|ordenada",
     "z": _place("z"),
 }
-_UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|ms|s|sec|min|pixels?|px|deg|rad|°"
+_UNITS = r"%|percent|m?N|k?N|kgf|lbf|[kMG]?Pa|N/mm\^?[2²]|psi|ksi|mm/mm|m/m|[mcµu]?m|[mnµu]?s|sec|min|pixels?|px|deg|rad|°|мм|с|к?Н|[кМ]?Па"
 UNIT_IN_TITLE = re.compile(rf"[(\[<]([^()\[\]<>]*)[)\]>]\s*$|(?:[\s_]in\s|\s*[/,;:]\s*|[\s_])({_UNITS})$")
 """The unit at the end of a title: in brackets, or after `in`, a slash, a comma or a blank."""
 POINT = re.compile(r"(?P<name>.*?\w)[ _.:/-]*(?P<axis>[xyz])|(?P<first>[xyz])[ _.:-]*(?P<rest>\w.*)")
@@ -127,6 +133,8 @@ def find_columns(titles: Sequence[str], given: dict[str, str] | None = None, uni
         unit, base = units[i] if units is not None else "", re.sub(r"_[12]$", "", quantity)
         if unit and base in _SIBLINGS and not measures(unit, _EXPECTED[base]) and measures(unit, _EXPECTED[_SIBLINGS[base]]):
             quantity = _SIBLINGS[base] + quantity[len(base) :]
+        if quantity == "id" and bare.startswith("track") and "id" not in (given or {}):
+            found["id"] = i  # beside it stands a number of each row, not of each point
         found.setdefault(quantity, i)
     return found | _by_company(titles, units, found)
 

@@ -15,6 +15,7 @@ _SPELLED = {
     "lbs": "lbf", "lb": "lbf", "pounds": "lbf", "kp": "kgf", "kg": "kgf", "°": "deg", "grad": "deg", "µstrain": "microstrain",
     "g": "gram_force",
     "m/m": "", "in/in": "", "cm/cm": "", "secs": "s", "sekunden": "s", "secondes": "s", "segundos": "s", "minuten": "min", "minutes": "min",
+    "с": "s", "мм": "mm", "н": "N", "кн": "kN", "па": "Pa", "кпа": "kPa", "мпа": "MPa", "秒": "s", "毫米": "mm", "牛": "N", "千牛": "kN",
 }  # fmt: skip
 
 
