@@ -17,6 +17,7 @@ if not FOLDER.is_dir():
     pytest.skip("the benchmarks do not come with the installed package", allow_module_level=True)
 sys.path.insert(0, str(FOLDER))
 
+import cases  # noqa: E402
 import plain  # noqa: E402
 import rollout  # noqa: E402
 import room  # noqa: E402
@@ -47,6 +48,13 @@ def test_plain_rollout_is_the_same_physics(friction):
     for ours, other in zip(gradients, gradients_plain):
         assert ours.norm() > 0
         assert (ours - other).norm() <= 1e-3 * ours.norm()
+
+
+def test_each_shared_case_names_its_test():
+    assert [case.number for case in cases.CASES] == list(range(1, 32))
+    for case in cases.CASES:
+        file, _, name = case.test.partition("::")
+        assert f"def {name}(" in (FOLDER.parent / file).read_text(), case.test
 
 
 def test_plain_rollout_refuses_what_it_does_not_do():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
+import neuido
 from neuido.data.measured.material_test import read_material_tests
 from neuido.discrepancy.inference.search.attribution import diagnose
 from neuido.discrepancy.problems.specimens.material import MaterialProblem
@@ -41,6 +42,15 @@ def test_clocks_of_any_origin(tmp_path, origin):
     }  # fmt: skip
     (tmp_path / "track.yaml").write_text(yaml.safe_dump(content))
     nothing_found(tmp_path)
+
+
+@pytest.mark.slow
+def test_case_of_unseen_markers(data_root):
+    """Markers at the origin were not seen: the body lacks nothing, and has the modulus of which it was made."""
+    with pytest.warns(UserWarning, match="count as not seen"):
+        found = neuido.diagnose(data_root / "cases" / "27-experiment-marker-zeros", device="cpu")
+    assert found.answer == "none"
+    assert yaml.safe_load(found.model_after.read_text())["elasticity"]["young"] == pytest.approx(5e4, abs=1e3)
 
 
 def test_case_of_a_biaxial_grid(data_root):
