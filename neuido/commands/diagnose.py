@@ -52,6 +52,7 @@ def diagnose(
         effort: Work of the search for each body: quick, normal or thorough. What was left out is reported, and the same command with more
             effort continues from there. The answer goes by this work, not by how fast the machine is.
         minutes: Time after which the search of each body is stopped; 0: none. The same command with more minutes continues from there.
+            On a CPU the time that other processes take does not count.
         device: auto, cpu or cuda.
         resume: Continue from the predictions that an interrupted run left in OUT/.work.
         progress: Show progress: one line on a terminal, otherwise a line every half minute.

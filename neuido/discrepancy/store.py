@@ -341,6 +341,12 @@ AFTER = 200
 """Number of simulations expected after the search: for open decisions, the last fit and its intervals."""
 
 
+def own_clock() -> Callable[[], float]:
+    """Return a clock [s] from now on that stands still while other processes have the processor, so that their work ends no search."""
+    begun, used = time.monotonic(), time.process_time()
+    return lambda: min(time.monotonic() - begun, time.process_time() - used)
+
+
 class Budget:
     """The work that a search may do, and its time limit.
 

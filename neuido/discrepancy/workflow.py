@@ -80,7 +80,8 @@ def diagnose(
         max_effects: Largest number of effects that may be added, 1 to 3.
         effort: Work of the search for each body: quick, normal or thorough (`EFFORTS`). A search that ends early names what it left out,
             and the same call with more effort continues.
-        minutes: Time after which the search of each body is stopped [min]; 0: none. The answer is `unfinished` then.
+        minutes: Time after which the search of each body is stopped [min]; 0: none. The answer is `unfinished` then. On a CPU the time that
+            other processes take does not count.
         device: auto, cpu, cuda or cuda:N.
         resume: Continue from the predictions that an interrupted run left in `out`/.work. Folders only.
         statistics: Keep in `out`/fits what the decision rests on, to be decided again without simulations; this takes some more of them.
@@ -154,7 +155,8 @@ def diagnose(
                 log.begin(problem.name if len(problems) > 1 else "", seconds)
                 log(f"fitting the declared model ({kind}, {len(problem.candidates)} effects to consider)")
                 try:
-                    limits = {"most": max_effects, "passes": EFFORTS[effort], "seconds": seconds}
+                    clock = store.own_clock() if chosen == "cpu" else time.monotonic
+                    limits = {"most": max_effects, "passes": EFFORTS[effort], "seconds": seconds, "clock": clock}
                     own = infer(cached, draws=draws, seed=seed, tell=log, statistics=statistics, **limits)
                 except UserError:
                     if untouched:
@@ -333,9 +335,11 @@ def solved_by(problem: "Problem", solver: str) -> "Problem":
         raise UserError(f"solver = {solver!r}: choose from {', '.join(SOLVERS)}")
     if solver == "both":
         return problem
-    if problem.settings == 1:
-        raise UserError(f"solver = {solver}: {problem.name} is no body, and nothing is discretised; leave it out")
+    from neuido.discrepancy.problems.rollouts import BodyRollouts
     from neuido.discrepancy.problems.settings import SETTINGS
+
+    if not isinstance(problem, BodyRollouts):
+        raise UserError(f"solver = {solver}: {problem.name} is no body that moves, which these methods simulate; leave it out")
 
     own = tuple(i for i in problem.solvers if SETTINGS[i].solver == solver)
     if not own:

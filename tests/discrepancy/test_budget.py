@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from neuido.discrepancy import store
 from neuido.discrepancy.inference import discretisation
 from neuido.discrepancy.inference.laboratory import Laboratory
 from neuido.discrepancy.inference.search import attribution, base_fits, next_effect
@@ -57,6 +58,17 @@ def test_the_time_ends_all_steps_alike():
     assert not limit.over
     clock.now = 101.0
     assert limit.over
+
+
+def test_the_time_of_others_does_not_count(monkeypatch):
+    elapsed, used = Clock(0.0), Clock(0.0)
+    monkeypatch.setattr(store.time, "monotonic", elapsed)
+    monkeypatch.setattr(store.time, "process_time", used)
+    clock = store.own_clock()
+    elapsed.now, used.now = 20.0, 3.0  # beside other processes
+    assert clock() == 3.0
+    elapsed.now, used.now = 20.0, 35.0  # two threads
+    assert clock() == 20.0
 
 
 def test_where_a_simulation_is_slow_the_search_is_stopped_earlier():

@@ -185,7 +185,7 @@ def test_wrong_folder_is_one_line(name, folders, tmp_path, capsys):
         (["--effects", "yield"], "drag_linear"),
         (["--model", "nowhere.yaml"], "nowhere.yaml"),
         (["--solver", "abacus"], "abacus"),
-        (["--solver", "finite_elements"], "nothing is discretised"),
+        (["--solver", "finite_elements"], "is no body that moves"),
     ],
 )
 def test_wrong_option_is_one_line(more, word, folders, tmp_path, capsys):

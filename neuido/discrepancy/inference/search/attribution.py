@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from time import monotonic
 
 import numpy as np
 
@@ -176,6 +177,7 @@ def diagnose(
     tell: Tell | None = None,
     passes: float = math.inf,
     seconds: float = math.inf,
+    clock: Callable[[], float] = monotonic,
     statistics: bool = False,
 ) -> Diagnosis:
     """Fit the declared model, search for effects that it lacks, and return what was found.
@@ -188,14 +190,14 @@ def diagnose(
         most: Largest number of effects that may be added.
         tell: Function that is called with each line of progress.
         passes: Work of the search, in runs of the declared model through all recordings under the suggested setting.
-        seconds: Time [s] after which the search is stopped; see `Budget`.
+        seconds: Time [s] by `clock` after which the search is stopped; see `Budget`.
         statistics: Keep what a likelihood needs of the best fits, which takes further simulations.
 
     Raises:
         UserError: No method can predict the declared model; the message is that of its simulator.
     """
     memo, journal = Memo(problem), Journal()
-    budget = budget_of(problem, memo, passes, seconds)
+    budget = budget_of(problem, memo, passes, seconds, clock)
     if (watch := getattr(tell, "watch", None)) is not None:
         watch(budget)
 
@@ -344,13 +346,10 @@ def weigh_together(course: Course) -> None:
     course.at = base_fits.finished(lab, Stand(fit, floor, lab.mean_squares([fit.point], floor)[0]))
 
 
-def budget_of(problem: Problem, memo: Memo, passes: float, seconds: float) -> Budget:
-    """Return the budget of a search, in the unit of `Problem.effort` (particle-substeps for a body).
-
-    The budget therefore grows with the size of the body.
-    """
+def budget_of(problem: Problem, memo: Memo, passes: float, seconds: float, clock: Callable[[], float]) -> Budget:
+    """Return the budget of a search in the unit of `Problem.effort` (particle-substeps for a body), so that it grows with the body."""
     one = sum(problem.effort(n, problem.solvers[0]) for n in range(len(problem.recordings)))
-    return Budget(passes * one, spent=lambda: memo.effort, seconds=seconds, pace=lambda: memo.pace)
+    return Budget(passes * one, spent=lambda: memo.effort, seconds=seconds, clock=clock, pace=lambda: memo.pace)
 
 
 def conclude(search: Search, before: Stand, after: Stand, found: list[Trial], rounds: list[Round]) -> Diagnosis:
