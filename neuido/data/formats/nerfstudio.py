@@ -5,6 +5,7 @@ moves. Frames without `view` belong to the same view if they have the same pose.
 time, each folder holds the images of a camera that moves. If frames have neither key, each pose is a view of the same moment.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,9 @@ PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3")
 UNKNOWN_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "b1", "b2")
 """Distortion coefficients that are not supported; they must be zero."""
-FISHEYES = ("is_fisheye", "fisheye", "ftheta_p0", "equirectangular")
+WIDE = re.compile(r"fish_?eye|ftheta|equirect|panoram|spherical|omnidirect", re.IGNORECASE)
+"""What names a lens that is no pinhole, in a key or in the value of one of `LENSES`."""
+LENSES = ("lens", "lens_model", "lens_type", "distortion_model", "camera_type", "projection", "projection_type")
 FOCAL = {"fl_x", "camera_angle_x", "camera_angle_y"}
 ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
@@ -171,9 +174,13 @@ def _shot(
     model = entry.get("camera_model", "OPENCV")
     if model not in PINHOLES:
         raise UserError(f"{where}.camera_model = {model!r} must be one of {', '.join(PINHOLES)}: undistort the images first")
-    for key in FISHEYES:
-        if entry.get(key):
-            raise UserError(f"{where}.{key} = {entry[key]!r}: fisheye and panoramic lenses are not supported: undistort the images first")
+    for key, value in entry.items():
+        if value and (WIDE.search(key) or (key in LENSES and WIDE.search(str(value)))):
+            raise UserError(
+                f"{where}.{key[:40]} = {str(value)[:40]!r}: fisheye and panoramic lenses are not supported: undistort the images first"
+            )
+    if "rolling_shutter" in entry and np.any(entry["rolling_shutter"]):
+        raise UserError(f"{where}.rolling_shutter = {str(entry['rolling_shutter'])[:60]} is not supported: film with a global shutter")
     size = _size(entry, where) if "w" in entry and "h" in entry else image_size(image)
     K = _lens(own, shared, size, where)
     lens = _distortion(own, shared, where)

@@ -56,6 +56,19 @@ def test_terms_of_lenses_that_are_not_applied(tmp_path, key, frame):
     assert read_recording(folder(tmp_path, root=absent)).distortion is None
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("fisheye_crop_radius", 100.0), ("lens", "fisheye"), ("distortion_model", "OPENCV_FISHEYE"), ("projection", "Equirectangular"),
+     ("ftheta_p0", 0.1), ("rolling_shutter", [0.0, 0.0, 0.01, 0.0]), ("rolling_shutter", True)],
+)  # fmt: skip
+@pytest.mark.parametrize("frame", [False, True])
+def test_lenses_by_other_keys(tmp_path, key, value, frame):
+    with pytest.raises(UserError, match=rf"frames\[0\].{key} = .* not supported"):
+        read_recording(folder(tmp_path, root={} if frame else {key: value}, each=lambda v, t: {key: value} if frame else {}))
+    absent = {"fisheye_crop_radius": 0, "lens": "pinhole", "rolling_shutter": [0, 0, 0, 0], "distortion_model": "radial"}
+    assert len(read_recording(folder(tmp_path, root=absent)).views) == 3
+
+
 def test_list_of_distortion_parameters(tmp_path):
     found = read_recording(folder(tmp_path, root={"distortion_params": [0.1, 0.2, 0.3, 0.0, 0.4, 0.5]}))
     assert found.distortion[0].tolist() == [0.1, 0.2, 0.4, 0.5, 0.3]
