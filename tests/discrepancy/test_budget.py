@@ -83,7 +83,7 @@ def test_where_a_simulation_is_slow_the_search_is_stopped_earlier():
 
 def told(passes: float, clock: Clock, monkeypatch, seconds: float = 1000.0):
     """What a search by two methods says, what it left out, and what it ran."""
-    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, clock=clock, **options))
+    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, **(options | {"clock": clock})))
     problem = Line(lambda t: 3.0 * t + 2.0 * np.sin(9.0 * t) + 0.3 * np.sin(33 * t), wiggle=0.1, solvers=(0, 1), together=False)
     found = diagnose(problem, draws=19, passes=passes, seconds=seconds)
     return found.answer, found.left_out, found.after, [w.simulations for w in found.work.values()], found.budget.ended_by
@@ -106,7 +106,7 @@ def test_the_speed_of_a_machine_changes_nothing(passes, monkeypatch):
 def test_what_takes_long_after_the_search_is_left_out_too(block, monkeypatch):
     """A class whose next experiment would be simulated past the end."""
     clock = Clock(0.0)
-    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, clock=clock, **options))
+    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, **(options | {"clock": clock})))
     found = diagnose(restricted(body_problem(block), "drag_linear,drag_quadratic"), draws=39, most=1, seconds=60.0)
     found.rounds[0].members = found.rounds[0].trials[:2]
     assert next_experiment.propose(found) is not None and found.left_out == ()
@@ -141,7 +141,7 @@ def block(tmp_path_factory):
 @pytest.mark.slow
 def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypatch):
     """The direction of a drag is all but exact, so that even the start of its fit is worth naming; nothing is refined, and it is told."""
-    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, clock=Clock(step), **options))
+    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, **(options | {"clock": Clock(step)})))
     problem = restricted(body_problem(block), "drag_linear,viscosity_shear,time_force")
     found = diagnose(problem, draws=39, most=2, seconds=60.0)
     assert math.isfinite(found.errors["after"]["drop"]) and found.evaluations > 0
@@ -160,7 +160,7 @@ def test_a_search_without_time_answers_from_its_first_fits(step, block, monkeypa
 def test_the_last_fit_has_what_is_left_of_the_time(settled, block, monkeypatch):
     """When the search ends with an effect named, that is fitted to its end, and nothing is looked for beside it."""
     clock, over, asked = Clock(0.0), [], []
-    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, clock=clock, **options))
+    monkeypatch.setattr(attribution, "Budget", lambda work, **options: Budget(work, **(options | {"clock": clock})))
     sought, finished = next_effect.find, base_fits.finished
 
     def late(self, *args, **options):
