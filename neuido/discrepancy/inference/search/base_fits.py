@@ -122,8 +122,9 @@ def scaled_starts(lab: Laboratory, floor: Floor) -> list[Point]:
     for p in lab.problem.declared:
         if p.log:
             scan = {k: {p.name: p.within(p.value * 2.0**k)} for k in range(-DOUBLINGS, DOUBLINGS + 1)}
-            able = [k for k, point in scan.items() if lab.problem.margin(point, lab.setting) >= 0.0]
-            costs = dict(zip(able, lab.costs([scan[k] for k in able], first), strict=True))
+            with lab.early(HORIZONS[0]):
+                able = [k for k, point in scan.items() if lab.problem.margin(point, lab.setting) >= 0.0]
+                costs = dict(zip(able, lab.costs([scan[k] for k in able], first), strict=True))
             best = min(able, key=lambda k: costs[k], default=0)
             out += [scan[k] for k in (-1, 1, *({best} - {-1, 0, 1}))]
     return out
