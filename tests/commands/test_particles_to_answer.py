@@ -20,7 +20,9 @@ def run(words, capsys):
     return stop.value.code or 0, (said.out + said.err).splitlines()
 
 
-def test_five_commands_lead_to_the_drag(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("guess", ["1e5", "6e5"])
+def test_five_commands_lead_to_the_drag(guess, tmp_path, capsys, monkeypatch):
+    """With a guess of the modulus that is nearly right, and one ten times too stiff."""
     monkeypatch.chdir(tmp_path)
     made = record(tmp_path / "truth", UNDECLARED, launches=LAUNCHES, side=4, frames=12)
     rows = [
@@ -32,7 +34,7 @@ def test_five_commands_lead_to_the_drag(tmp_path, capsys, monkeypatch):
     (tmp_path / "particles.csv").write_text("\n".join(["take;Zeit [ms];Punkt;X [mm];Y [mm];Z [mm]", *rows, ""]).replace(".", ","))
     status, said = run(["import", "particles.csv"], capsys)
     assert status == 2 and len(said) == 1 and all(option in said[0] for option in ("--density", "--young", "--out FOLDER"))
-    status, said = run(["import", "particles.csv", "--density", "1000", "--young", "1e5", "--out", "cube"], capsys)
+    status, said = run(["import", "particles.csv", "--density", "1000", "--young", guess, "--out", "cube"], capsys)
     text = "\n".join(said)
     assumed = ["at rest without stress in the first frame", "m^3 each", "mm apart", "Young's modulus", "(assumed: --poisson)"]
     for words in ("read as points on a deforming body", *assumed, "along -y (--up z", "no floor (--floor", "held out: particles-toss"):
