@@ -241,6 +241,7 @@ def schemas() -> dict[str, Schema]:
                         {
                             "forces": {"anyOf": [TEXT, {"type": "null"}]},
                             "noise": {"oneOf": [{"type": "null"}, record({}, {"displacement": POSITIVE, "force": POSITIVE})]},
+                            "continues": {"anyOf": [TEXT, {"type": "null"}]},
                         },
                     )
                 ),

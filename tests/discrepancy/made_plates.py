@@ -7,7 +7,7 @@ import torch
 import yaml
 
 from neuido.physics.plane.plane_law import PlaneLaw
-from neuido.physics.plane.plane_specimen import PlaneSpecimen
+from neuido.physics.plane.plane_specimen import PlaneMotion, PlaneSpecimen
 
 TRUE = {"law": "decoupled_neo_hookean", "young": 2.7e6, "poisson": 0.35}
 SIZE = 0.1
@@ -40,6 +40,7 @@ def write_plate(
     stated: bool = True,
     scale: float = 1.0,
     order: np.ndarray | None = None,
+    continues: bool = False,
 ) -> Path:
     """Write a plate that is pulled along x and half as much along y: load steps to fit, and further ones that are held out.
 
@@ -54,6 +55,7 @@ def write_plate(
         stated: Whether the folder states the noise.
         scale: Factor on all lengths; forces stay those of a plate of the first size.
         order: Order of the nodes.
+        continues: Whether the second recording begins where the first one ends; both begin at rest otherwise.
     """
     nodes, triangles = mesh()
     specimen = PlaneSpecimen(torch.from_numpy(nodes), torch.from_numpy(triangles), 0.002, condition)
@@ -72,8 +74,10 @@ def write_plate(
     law = PlaneLaw(elasticity, effects or {}, centres=specimen.centres)
     recordings = []
     for name, role, own in zip(("low", "high"), ("fit", "held_out"), stretches):
-        motion = torch.tensor(np.array(own)[:, None, None] * nodes * [1.0, 0.5])
-        found = specimen.equilibrium(law, torch.from_numpy(fixed), motion)
+        before = stretches[0] if continues and name == "high" else ()
+        motion = torch.tensor(np.array((*before, *own))[:, None, None] * nodes * [1.0, 0.5])
+        found = PlaneMotion(*(part[len(before) :] for part in specimen.equilibrium(law, torch.from_numpy(fixed), motion)))
+        motion = motion[len(before) :]
         u, files = found.displacement.numpy() + noise * rng.standard_normal(motion.shape), []
         for t, moved in enumerate(u):
             files.append(f"{name}_{t}.csv")
@@ -84,6 +88,7 @@ def write_plate(
         text = ",".join(title for _, title in sums) + "\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n"
         (folder / f"forces_{name}.csv").write_text(text)
         entry = {"name": name, "role": role, "displacements": files, "forces": f"forces_{name}.csv"}
+        entry |= {"continues": "low"} if before else {}
         recordings.append(entry | ({"noise": {"displacement": noise * scale}} if stated else {}))
     content = {"format": "neuido-plane/1", "name": "plate", "model": model, "boundary": {"left_x": "held", "bottom_y": "held"}}
     content |= {"specimen": {"nodes": "nodes.csv", "elements": "elements.csv", "thickness": 0.002 * scale, "condition": condition}}

@@ -57,7 +57,7 @@ class Boundary:
 
 @dataclass(frozen=True, eq=False)
 class PlaneRecording:
-    """Load steps of the specimen, from rest."""
+    """Load steps of the specimen, one after the other."""
 
     name: str
     role: str
@@ -70,6 +70,8 @@ class PlaneRecording:
     """Stated standard deviation of the noise of a displacement [m]; None: to be estimated."""
     force_noise: float | None = None
     """Stated standard deviation of the error of a force [N]; None: that of a testing machine of class 1."""
+    continues: str = ""
+    """Name of the earlier recording in whose last state this one begins; empty: it begins at rest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,12 @@ def read_plane_experiment(path: str | os.PathLike, *, model: Mapping[str, Any] |
         recordings = read_entries(
             content["recordings"], "recordings", "recording", lambda entry, where: _recording(entry, where, folder, specimen, boundary)
         )
+        for n, recording in enumerate(recordings):
+            if recording.continues and recording.continues not in (before := [r.name for r in recordings[:n]]):
+                raise UserError(
+                    f"recordings[{n}] ({recording.name}).continues = {recording.continues!r} must name an earlier recording: "
+                    f"{', '.join(before) or 'there is none'}"
+                )
         if not any(recording.role == "fit" for recording in recordings):
             raise UserError("recordings has no entry with role fit: give at least one")
         found = PlaneExperiment(name, folder, declared, free, effects, specimen, boundary, recordings)
@@ -202,7 +210,7 @@ def _boundary(motions: Any, marks: Mapping[str, Sequence[str]]) -> tuple[Boundar
 
 
 def _recording(entry: Any, where: str, folder: Path, specimen: PlaneSpecimen, boundary: Sequence[Boundary]) -> PlaneRecording:
-    check_keys(entry, where, ("name", "role", "displacements", "forces", "noise"), ("forces", "noise"))
+    check_keys(entry, where, ("name", "role", "displacements", "forces", "noise", "continues"), ("forces", "noise", "continues"))
     name = file_name(entry["name"], f"{where}.name")
     where = f"{where} ({name})"
     role = read_role(entry["role"], where)
@@ -232,7 +240,8 @@ def _recording(entry: Any, where: str, folder: Path, specimen: PlaneSpecimen, bo
     noise = mapping(entry.get("noise") or {}, f"{where}.noise")
     check_keys(noise, f"{where}.noise", ("displacement", "force"), ("displacement", "force"))
     stated = {key: number(value, f"{where}.noise.{key}", above=0.0) for key, value in noise.items()}
-    return PlaneRecording(name, role, np.stack(steps), force, stated.get("displacement"), stated.get("force"))
+    continues = read_text(entry["continues"], f"{where}.continues") if entry.get("continues") is not None else ""
+    return PlaneRecording(name, role, np.stack(steps), force, stated.get("displacement"), stated.get("force"), continues)
 
 
 def _check(found: PlaneExperiment) -> None:
@@ -303,6 +312,8 @@ def _check_forces(found: PlaneExperiment, recording: PlaneRecording, where: str)
                     PlausibilityWarning,
                     stacklevel=2,
                 )
+    if recording.continues:
+        return  # what has yielded leaves forces against the motion from rest
     ratio = stiffness_ratio(found.specimen, found.boundary, recording.displacement[last], force[last], found.model["elasticity"])
     if ratio is None:
         return

@@ -20,6 +20,8 @@ from neuido.types import brief_fields
 
 TOLERANCE = 1e-10
 """Largest imbalance of the forces of free nodes, relative to the largest force of a node."""
+LEAST_STRAIN = 1e-4
+"""Strain whose forces the imbalance is measured by where those of the specimen are smaller, as where it is back at rest."""
 ITERATIONS = 25
 """Largest number of Newton steps of a load step; a step that needs more is halved."""
 HALVINGS = 8
@@ -238,12 +240,14 @@ class PlaneSpecimen:
     def _solved(self, law: "PlaneLaw | SpatialLaw", fixed: Tensor, trial: Tensor, before: Tensor) -> "Solution | None":
         """Return the equilibrium with the prescribed displacements of `trial`; None where Newton's method fails."""
         u, free, factor = before, ~fixed.reshape(-1), None
+        extent = float((self.nodes.amax(0) - self.nodes.amin(0)).max())
         jump = torch.where(fixed, trial - before, 0.0).reshape(-1)
         for iteration in range(ITERATIONS):
             force, matrix = self.assembled(law, u)
             if not bool(torch.isfinite(force).all()):
                 return None
-            if factor is not None and float(force[free].abs().max()) <= TOLERANCE * float(force.abs().max()):
+            size = max(float(force.abs().max()), LEAST_STRAIN * float(abs(matrix).max()) * extent)
+            if factor is not None and float(force[free].abs().max()) <= TOLERANCE * size:
                 return Solution(torch.where(fixed, trial, u), force, factor, float(law.moduli.mu) if isinstance(law, PlaneLaw) else 1.0)
             right = force + (torch.from_numpy(matrix @ jump.numpy()) if not iteration else 0.0)
             move = jump.clone() if not iteration else torch.zeros_like(jump)

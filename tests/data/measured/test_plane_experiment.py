@@ -66,6 +66,7 @@ def turned(step, nodes):
     [
         ({"nodes": [(*row[:2], "", "") for row in NODES]}, "the specimen can move freely: name in boundary_x"),
         ({"nodes": [*NODES, (3, 3, "", "")]}, "1 nodes belong to no triangle, the first is 5"),
+        ({"entry": {"continues": "later"}}, "continues = .later. must name an earlier recording: there is none"),
         ({"elements": ((0, 1, 4), (1, 2, 9))}, "triangles name the nodes 0 to 9, and there are 5"),
         ({"elements": ((0, 1, 4), (1, 2, 2.5))}, "must be whole numbers, counted from 0"),
         ({"nodes": [(1e3 * row[0], 1e3 * row[1], *row[2:]) for row in NODES]}, "the specimen is 1000 m large: give places in m"),

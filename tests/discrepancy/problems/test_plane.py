@@ -69,6 +69,17 @@ def test_a_law_without_equilibrium_is_no_prediction(tmp_path):
     assert np.isnan(own.predict([{"stiffness_gradient.x": 1e4}], 0)).all()
 
 
+def test_a_recording_continues_what_has_yielded(tmp_path):
+    """Loading, then unloading: the later part begins with the plastic strain of the earlier one."""
+    effects, cycle = {"yield.inverse": 2e-6}, ((0.2,), (0.1,))
+    options = {"effects": effects, "noise": 1e-9, "stretches": cycle}
+    own = problem(write_plate(tmp_path / "a", declared() | {"elasticity": TRUE}, continues=True, **options))
+    folder = write_plate(tmp_path / "b", declared() | {"elasticity": TRUE}, **options)
+    truth, rest = own.experiment.recordings[1].displacement, problem(folder).fields(effects, 1)["displacement"]
+    np.testing.assert_allclose(own.fields(effects, 1)["displacement"], truth, atol=1e-8)
+    assert np.abs(rest - truth).max() > 1e-3 * SIZE
+
+
 def test_a_declared_effect_is_kept(tmp_path):
     model = declared() | {"effects": {"strain_stiffening": 0.3}}
     own = problem(write_plate(tmp_path / "a", model, effects={"strain_stiffening.k": 0.3}))

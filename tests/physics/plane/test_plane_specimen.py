@@ -48,6 +48,13 @@ def test_a_thin_strip_is_a_uniaxial_test(law):
     assert float(found.force.sum(1).abs().max()) < 1e-9
 
 
+def test_back_at_rest_no_force_is_left():
+    own = sheet()
+    fixed, motion = pulled(own, [1.2, 1.0])
+    found = own.equilibrium(NeoHookean(2.7e6, 0.35), fixed, motion)
+    assert float(found.displacement[1].abs().max()) < 1e-12 and float(found.force[1].abs().max()) < 1e-9 * float(found.force[0].abs().max())
+
+
 def test_a_thick_one_is_held_across():
     """Plane strain of a sheared neo-Hookean block: the same displacement at the edges gives a uniform one inside, tau_12 = mu gamma."""
     own = sheet()

@@ -130,6 +130,8 @@ def write_plane_folder(
         if own:
             entry: dict[str, Any] = {"name": role, "role": role, "displacements": [f"{name}.csv" for name in own]}
             content["recordings"].append(entry | ({"forces": f"forces_{role}.csv"} if force is not None else {}))
+    if list(roles.values()) == sorted(roles.values()) and len(content["recordings"]) > 1:
+        content["recordings"][1]["continues"] = "fit"  # all load steps to fit come first
     held = [name for name, role in roles.items() if role == "held_out"]
     notes.append(f"held out: {', '.join(held)} (--held_out NAMES)" if held else "no load step is held out (--held_out NAMES)")
 

@@ -1,6 +1,6 @@
 """A plane specimen as a `Problem`: displacements of the free nodes and reaction forces under the measured motion of the boundary."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,10 +53,13 @@ class PlaneProblem(Problem):
         made = []
         fixed = torch.from_numpy(experiment.prescribed)
         law = self._law({}, known=True)
-        for recording in experiment.recordings:
+        names = [recording.name for recording in experiment.recordings]
+        self._earlier = [names.index(r.continues) if r.continues else None for r in experiment.recordings]
+        for n, recording in enumerate(experiment.recordings):
             sigma = recording.displacement_noise or displacement_noise(experiment, recording)
             scale = sigma / force_noise(recording)
-            steps, u, own = [], torch.zeros_like(experiment.specimen.nodes), law
+            steps: list[Step] = []
+            own, u = self._begun(law, n)
             for t in range(len(recording.displacement)):
                 motion = prescribed_motion(experiment, recording, t)
                 try:
@@ -94,6 +97,30 @@ class PlaneProblem(Problem):
             partners = {key: value for key, value in self._partners.items() if key.partition(".")[0] in named}
             effects = partners | effects | {name: float(value) for name, value in point.items() if "." in name}
         return PlaneLaw(elasticity, effects, centres=self.experiment.specimen.centres)
+
+    def _begun(self, law: PlaneLaw, recording: int) -> tuple[PlaneLaw, Tensor]:
+        """Return the law and the displacements (N, 2) [m] at the start of a recording: after the one that it continues, or at rest.
+
+        Raises:
+            UserError: A load step before has no equilibrium.
+        """
+        earlier = self._earlier[recording]
+        if earlier is None or not law.yields:
+            return law, torch.zeros_like(self.experiment.specimen.nodes)
+        last, law = list(self._path(*self._begun(law, earlier), earlier))[-1]
+        return law, last.displacement
+
+    def _path(self, law: PlaneLaw, begun: Tensor, recording: int) -> Iterator[tuple[Solution, PlaneLaw]]:
+        """Yield the equilibrium of each load step, and the law after it.
+
+        Raises:
+            UserError: A load step has no equilibrium.
+        """
+        fixed = torch.from_numpy(self.experiment.prescribed)
+        for t, step in enumerate(self._steps[recording]):
+            solution, _, law = self.experiment.specimen.followed(law, fixed, begun, step.motion, t)
+            begun = solution.displacement
+            yield solution, law
 
     def _step(
         self, recording: PlaneRecording, t: int, motion: Tensor, fixed: Tensor, known: Solution, law: PlaneLaw, sigma: float, scale: float
@@ -147,7 +174,7 @@ class PlaneProblem(Problem):
         out = np.full((len(points), len(self.recordings[recording].y)), np.nan)
         steps, before = self._steps[recording], None
         for i, point in enumerate(points):
-            found = self._solved(point, steps, before)
+            found = self._solved(point, recording, before)
             if found is not None:
                 before = found
                 scale = self._forces_scale[recording]
@@ -155,27 +182,25 @@ class PlaneProblem(Problem):
                 out[i] = np.concatenate(made)
         return out
 
-    def _solved(self, point: Point, steps: Sequence[Step], before: Sequence[Solution] | None = None) -> list[Solution] | None:
+    def _solved(self, point: Point, recording: int, before: Sequence[Solution] | None = None) -> list[Solution] | None:
         """Return the equilibrium of each load step at a parameter set, from that of another one if it is given; None without one."""
         own, fixed = self.experiment.specimen, torch.from_numpy(self.experiment.prescribed)
         try:
             law = self._law(point)
+            if law.yields:
+                return [solution for solution, _ in self._path(*self._begun(law, recording), recording)]
             found: list[Solution] = []
-            for t, step in enumerate(steps):
+            for t, step in enumerate(self._steps[recording]):
                 begun = found[-1].displacement if found else torch.zeros_like(own.nodes)
-                if law.yields:
-                    solution, _, law = own.followed(law, fixed, begun, step.motion, t)
-                else:
-                    near = None if before is None else own.near(law, fixed, before[t])
-                    solution = near or own.near(law, fixed, step.known) or own.towards(law, fixed, begun, step.motion, t)
-                found.append(solution)
+                near = None if before is None else own.near(law, fixed, before[t])
+                found.append(near or own.near(law, fixed, step.known) or own.towards(law, fixed, begun, step.motion, t))
         except UserError:
             return None
         return found
 
     def fields(self, point: Point, recording: int) -> dict[str, np.ndarray]:
         """Return displacements (T, N, 2) [m] and forces of the parts of the boundary (T, B) [N] at a parameter set; NaN where it fails."""
-        found, measured = self._solved(point, self._steps[recording]), self.experiment.recordings[recording]
+        found, measured = self._solved(point, recording), self.experiment.recordings[recording]
         if found is None:
             return {"displacement": np.full_like(measured.displacement, np.nan), "force": np.full_like(measured.force, np.nan)}
         return {

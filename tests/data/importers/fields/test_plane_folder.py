@@ -40,6 +40,7 @@ def test_steps_of_a_finite_element_program(tmp_path):
     assert lines[-1].startswith("next: neuido check")
     found = neuido.read_plane_experiment(tmp_path / "out")
     assert [(r.name, len(r.displacement)) for r in found.recordings] == [("fit", 2), ("held_out", 1)]
+    assert [r.continues for r in found.recordings] == ["", "fit"]
     assert [part.name for part in found.boundary] == ["2_x", "1_x", "3_y"]
     np.testing.assert_allclose(found.recordings[0].displacement[1, 1], [1e-4, -3e-5])
     np.testing.assert_allclose(found.recordings[1].force, [[220, -220, 0]])
