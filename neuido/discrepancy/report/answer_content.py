@@ -13,7 +13,7 @@ from neuido.discrepancy.inference.search.intervals import would_help
 from neuido.discrepancy.inference.search.judging import ALPHA
 from neuido.discrepancy.problems.problem import Problem
 from neuido.discrepancy.problems.settings import CONTACT_HEIGHT
-from neuido.discrepancy.problems.tracks.scale_error import rival_scale
+from neuido.discrepancy.problems.tracks.scale_error import gravity_found, rival_scale
 from neuido.discrepancy.report import ceiling, next_experiment, residual
 from neuido.discrepancy.report.reader_units import reach
 from neuido.discrepancy.report.wording import title
@@ -97,6 +97,9 @@ def describe(d: Diagnosis, *, device: str, seed: int = 0, tell: Callable[[str], 
     size = sum(len(r.chosen.candidate.parameters) for r in d.rounds if r.chosen is not None)
     if content["effects"] and (scale := rival_scale(d.problem, d.before, d.after, size)) is not None:
         content["scale_error"] = scale
+    named = {name for e in content["effects"] for name in e["class"]}
+    if "gravity" in named and (gravity := gravity_found(inner(d.problem), d.after)) is not None:
+        content["gravity"] = gravity
     if "body" in d.problem.labels:
         content["body"] = d.problem.labels["body"]
     drawn = d.problem.silhouettes(d) if hasattr(d.problem, "silhouettes") else {}

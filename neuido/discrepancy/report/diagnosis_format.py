@@ -154,6 +154,7 @@ def schema() -> Schema:
             "doubts": mapping(listing(TEXT)),
             "unseen": TEXT,
             "scale_error": {"type": "array", "items": NUMBER},
+            "gravity": record(dict.fromkeys(("declared", "found", "length", "time"), NUMBER)),
             "silhouettes": {"type": "object"},
         },
     )

@@ -26,6 +26,8 @@ FINALISTS = 3
 """Number of changes whose distances are computed with a refit."""
 RUNS = 2.0
 """Number of neighbouring data that count as one, because their errors are not independent."""
+TELLS = 0.5 * math.log(10.0)
+"""Expected logarithm of the odds below which evidence is "not worth more than a bare mention" (Jeffreys, Theory of Probability, 1961)."""
 
 
 class Rival(NamedTuple):
@@ -42,7 +44,7 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
 
     Returns:
         `change`, `tells_apart` (the two nearest rivals), `expected_log_odds` (natural logarithm), and `others`, the next best changes.
-        None where there is no such class, no change can be simulated, or the time is up.
+        None where there is no such class, no change can be simulated or tells more than `TELLS`, or the time is up.
     """
     rivals = rivals_of(d)
     if len(rivals) < 2:
@@ -74,9 +76,9 @@ def propose(d: Diagnosis) -> dict[str, Any] | None:
         slopes = [_slopes(d, problem, rival, setting) for rival in rivals]
         odds, pair = _nearest(rows, slopes, sigma(rows))
         final.append((odds, pair, name))
-    if not final:
-        return None
     final.sort(key=lambda entry: -entry[0])
+    if not final or final[0][0] < TELLS:
+        return None
     odds, pair, name = final[0]
     return {
         "change": name,

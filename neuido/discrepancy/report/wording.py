@@ -252,6 +252,7 @@ def _finding(c: Content, units: Units) -> str:
         if more:
             out.append(f"What is left is {over:.0f} times what noise and discretisation leave.")
         out += [f"A limit and no size, since a later fit moved it: {e['at_limit']}." for e in effects if e.get("at_limit")]
+        out += [_ordinary(row, units) for row in c["power"] if _denied(row, effects)]
     elif answer == "none":
         out.append("Nothing is missing that these data could show.")
         out += [_ordinary(row, units) for row in c["power"] if row.get("ordinary")]
@@ -271,6 +272,14 @@ def _finding(c: Content, units: Units) -> str:
         if c["untried"]:
             out.append(f"Not tried: {listed([title(name) for name in c['untried']])}.")
     return " ".join(out)
+
+
+def _denied(row: Content, effects: Sequence[Content]) -> bool:
+    """Return whether the data, with what was named, leave such a body less of an effect than it has; a named drag is a drag of any law."""
+    if not row.get("ordinary") or row["up_to"] is None or row["up_to"] >= row["ordinary"]:
+        return False
+    kind = row["name"].partition("_")[0]
+    return all(name.partition("_")[0] != kind for e in effects for name in e["class"])
 
 
 def _ordinary(row: Content, units: Units) -> str:
@@ -347,7 +356,20 @@ def _sure(c: Content) -> str:
         amount = first if first == last else f"{first} to {last}"
         longer = "long" if c["scale_error"][0] > 0 else "short"
         out.append(f"A scale error would explain it as well, lengths measured {amount} % too {longer}: measure a known length.")
+    if c.get("gravity"):
+        out.append(_gravity(c["gravity"]))
     return " ".join(out)
+
+
+def _gravity(gravity: Content) -> str:
+    """Return a sentence on what looks like the gravity that was found."""
+    errors = {name: 100 * gravity[name] for name in ("length", "time")}
+    length, time = (f"{name}s measured {abs(x):.2g} % too {'long' if x > 0 else 'short'}" for name, x in errors.items())
+    found, declared = (f"{gravity[key]:.3g}" for key in ("found", "declared"))
+    return (
+        f"That is a gravity of {found} in place of {declared} m/s²; it is 9.78 to 9.83 on the ground, "
+        f"and {length} or {time} would look the same: check both first."
+    )
 
 
 def _not_excluded(c: Content, units: Units) -> str:

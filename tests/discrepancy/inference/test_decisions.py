@@ -158,10 +158,10 @@ def test_a_recording_that_does_not_move_is_left_out_of_the_report(lost, tmp_path
     found = attribution.diagnose(restricted(problem, "drag_linear"), draws=39, most=1)
     original_move = BodyProblem._move
 
-    def fails(self, runs, setting, finer=0, noted=None):
+    def fails(self, runs, setting, **options):
         if lost & {n for _, n in runs}:
             raise UserError("the motion of scene 0 is not finite from step 420 of 840 on")
-        return original_move(self, runs, setting, finer, noted)
+        return original_move(self, runs, setting, **options)
 
     monkeypatch.setattr(BodyProblem, "_move", fails)
     answer.write(tmp_path / "out", [(found, 1.0)], kind="experiment", device="cpu")

@@ -90,7 +90,7 @@ def test_a_declared_effect_is_kept(tmp_path):
 
 def test_a_wrong_option_is_said(tmp_path):
     folder = write_plate(tmp_path / "a", declared())
-    with pytest.raises(UserError, match="nothing is discretised"):
+    with pytest.raises(UserError, match="plate is no body that moves"):
         neuido.diagnose(folder, solver="finite_elements")
     with pytest.raises(UserError, match="can show none of them; it can show volumetric"):
         neuido.diagnose(folder, effects="drag_linear")

@@ -52,6 +52,33 @@ def _independent(row: np.ndarray, data: int, axes: int) -> float:
     return freedom + 1
 
 
+def gravity_found(problem: Problem, after: Point) -> dict[str, float] | None:
+    """Return the gravity that a free flight takes, and the errors of length and time that look like it.
+
+    A body under a gravity r times the true one moves as one whose lengths are measured r times too long, or whose times are measured
+    1 / sqrt(r) times as long.
+
+    Args:
+        problem: What was diagnosed.
+        after: The fit with a different gravity, or an acceleration that the data cannot tell from one.
+
+    Returns:
+        `declared` and `found` [m/s^2], and the relative errors `length` and `time`; None for other data than tracks of free bodies, and
+        where the gravity points the other way.
+    """
+    tracks = getattr(problem, "tracks", None)
+    if tracks is None or tracks.constraint is not None or problem.unit != "m":
+        return None
+    declared = float(np.linalg.norm(tracks.gravity))
+    if declared == 0.0:
+        return None
+    along = [after.get(f"uniform_acceleration.{a}", 0.0) * g / declared for a, g in zip("xyz", tracks.gravity, strict=True)]
+    found = declared + after.get("gravity.g", 0.0) + sum(along)
+    if found <= 0.0:
+        return None
+    return {"declared": declared, "found": found, "length": found / declared - 1.0, "time": math.sqrt(declared / found) - 1.0}
+
+
 def of_another_scale(tracks: Sequence[Track]) -> list[tuple[Track, float]]:
     """Return the recordings whose path is much longer or shorter than those of the others, with the ratio to their median."""
     lengths = [float(np.linalg.norm(np.ptp(track.x, axis=0))) for track in tracks]
