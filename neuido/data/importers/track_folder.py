@@ -12,6 +12,7 @@ from neuido.data.importers.declared_guide import Guide, declared_guide, guided_a
 from neuido.data.importers.plain_motion import ANGLE, REPEATED, Motion
 from neuido.data.importers.tables.checked_folder import write_tables
 from neuido.data.importers.tables.units import conversion_factor
+from neuido.data.measured.held_start import held_rows
 from neuido.data.measured.motion_plausibility import lost_positions
 from neuido.errors import UserError
 
@@ -144,6 +145,15 @@ def write_tracks(
             raise UserError(f"{path.name}: the point is at the same place in all {seen.sum()} frames: name the right columns, or --point")
         if still:
             summary.append(f"{path.name}: {', '.join(still)} does not change and is left out")
+        if guide.type == "none":
+            held = held_rows(t[seen], x[seen], [model["gravity"]["xyz".index(axis)] for axis in names])
+            if held:
+                first, after = t[seen][[0, held]]
+                summary.append(
+                    f"{path.name}: held at first, since it keeps its height for longer than a free body can: the {held} frames before "
+                    f"{after - first:.4g} s are left out"
+                )
+                seen[np.flatnonzero(seen)[:held]] = False
         kept, left = guided_axes(guide.type, x[seen], names)
         if left:
             summary.append(f"{path.name}: {left}")

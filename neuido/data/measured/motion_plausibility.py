@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from neuido.data.measured.held_start import held_rows
 from neuido.data.measured.plausibility import lone_jump
 from neuido.errors import PlausibilityWarning, UserError
 
@@ -245,6 +246,23 @@ def check_bounces(t: np.ndarray, x: np.ndarray, axis: str, where: str) -> None:
             f"{where}: {axis} turns round within a few rows at {t[row]:.4g} s (data row {row}), as in a bounce, and no constraint is "
             f"declared: give model.constraint: {{type: bounce, floor: {np.min(x):.4g}, restitution: 0.8}}, or rows: [0, {row}] "
             "(`neuido import --guide bounce`)"
+        )
+
+
+def check_released(t: np.ndarray, x: np.ndarray, gravity: Sequence[float], where: str) -> None:
+    """Warn of a free flight whose body is held at the start.
+
+    Args:
+        t: Times [s], (n,).
+        x: Coordinates [m], (n, A).
+        gravity: Declared gravity along each of them [m/s^2].
+        where: Name of the recording in messages.
+    """
+    held = held_rows(t, x, gravity)
+    if held:
+        _warn(
+            f"{where}: the point keeps its height for {t[held - 1] - t[0]:.3g} s, longer than a free body can: leave the first {held} data "
+            f"rows out (rows: [{held}, {len(t)}]), or give nuisances.release_time (s)"
         )
 
 

@@ -21,7 +21,14 @@ from neuido.data.measured.columns import (
     read_role,
     read_text,
 )
-from neuido.data.measured.motion_plausibility import check_bounces, check_figures, check_flight, check_track, check_upright
+from neuido.data.measured.motion_plausibility import (
+    check_bounces,
+    check_figures,
+    check_flight,
+    check_released,
+    check_track,
+    check_upright,
+)
 from neuido.errors import UserError
 from neuido.physics.effects.point_library import TRACK_ENTRIES
 from neuido.types import Vector
@@ -155,7 +162,10 @@ def read_tracks(path: str | os.PathLike, *, model: Mapping[str, Any] | None = No
             check_track(track.t, track.x, axes, where, free=constraint is None)
             check_constraint(constraint, track, bodies[track.body], gravity, where)
             if constraint is None and not track.angle and any(gravity[a] for a in track.axes):
-                check_upright(track.t, track.x, [gravity[a] for a in track.axes], axes, where)
+                along = [gravity[a] for a in track.axes]
+                check_upright(track.t, track.x, along, axes, where)
+                if nuisances["release_time"] == 0.0:
+                    check_released(track.t, track.x, along, where)
             for column, a in enumerate(track.axes if constraint is None else ()):
                 if abs(gravity[a]) > 1.0:
                     check_bounces(track.t, -math.copysign(1.0, gravity[a]) * track.x[:, column], AXES[a], where)
