@@ -11,7 +11,7 @@ from neuido.physics.colliders.tables import ColliderTable
 from neuido.physics.effects import coefficients
 from neuido.physics.effects.coefficients import Tables
 from neuido.physics.effects.parameters import Effects
-from neuido.physics.laws.base import ElasticLaw, PlasticLaw
+from neuido.physics.laws.base import ElasticLaw, Law, PlasticLaw
 from neuido.types import Particles, ParticleState
 
 
@@ -96,8 +96,12 @@ def prepare(
     """Validate and convert the inputs of a rollout, differentiable in all of them; arguments as for `mpm.Simulator.rollout`.
 
     Raises:
-        UserError: A shape that does not fit, an effect outside its range or without the law that it needs.
+        UserError: What is no law, a shape that does not fit, an effect outside its range or without the law that it needs.
     """
+    for name, law in (("elasticity", elasticity), ("plasticity", plasticity)):
+        if law is not None and not isinstance(law, Law):
+            pair = "; give the two laws of a pair one after the other: rollout(steps, *laws)" if isinstance(law, tuple) else ""
+            raise UserError(f"{name} of a rollout must be a law, and is of type {type(law).__name__}{pair}")
     count, like = solver.scene_count, solver.mass
 
     def own(t: Tensor) -> Tensor:

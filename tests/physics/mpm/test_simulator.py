@@ -362,6 +362,8 @@ def test_nodes_that_a_substep_empties_are_as_good_as_new():
         (dict(density=-3.0), "density is -3"),
         (dict(steps=10, every=3), "multiple of every"),
         (dict(steps=12, every=2, segment=5), "segment is 5"),
+        (dict(law=(FixedCorotated(1e5, 0.3), None)), "is of type tuple; give the two laws of a pair one after the other"),
+        (dict(law=1e5), "elasticity of a rollout must be a law, and is of type float"),
         (dict(effects=Effects(drag_linear=-1.0)), "drag_linear is -1"),
         (dict(effects=Effects(viscosity_shear=1e5)), r"a shear viscosity of 1e\+05 and a bulk viscosity of 0 Pa s"),
         (dict(effects=Effects(viscosity_shear=300.0, viscosity_bulk=1e5)), r"a shear viscosity of 300 and a bulk viscosity of 1e\+05 Pa s"),
@@ -374,8 +376,8 @@ def test_bad_input_is_one_clear_line(change, message):
     body = change.get("body", block((0.4, 0.4, 0.4), (0.6, 0.6, 0.6), (4, 4, 4)))
     with pytest.raises(UserError, match=message) as error:
         sim = Simulator(change.get("scene", Scene()), body, density=change.get("density", 1000.0), device=DEVICE)
-        sim.rollout(change.get("steps", 10), FixedCorotated(1e5, 0.3), effects=change.get("effects"), every=change.get("every", 1),
-                    segment=change.get("segment"))  # fmt: skip
+        options = {"effects": change.get("effects"), "every": change.get("every", 1), "segment": change.get("segment")}
+        sim.rollout(change.get("steps", 10), change.get("law", FixedCorotated(1e5, 0.3)), **options)
     assert "\n" not in str(error.value)
 
 
