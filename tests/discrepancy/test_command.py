@@ -22,6 +22,7 @@ from neuido.discrepancy.inference.search.decision import decide
 from neuido.discrepancy.inference.statistics import read_fits
 from neuido.discrepancy.problems.body import body_problem
 from neuido.discrepancy.problems.settings import SETTINGS
+from neuido.discrepancy.report.wording import MORE_LEFT
 from neuido.discrepancy.workflow import solved_by
 from tests import command
 from tests.discrepancy import made
@@ -309,7 +310,10 @@ def test_material_test_finds_its_stiffening(folders, tmp_path, capsys):
     change(M, "model", model)(path)
     status, out, _ = run(capsys, path, "--out", tmp_path / "second", *options)
     assert status == 0
-    assert out.startswith("Nothing is missing")
+    again = json.loads((tmp_path / "second" / "diagnosis.json").read_text())
+    assert MORE_LEFT in " ".join(content["words"])
+    assert again["answer"] == "unknown" and not again["effects"], "what the first answer left is no other effect"
+    assert again["error"]["after"]["held_out"] == pytest.approx(content["error"]["after"]["held_out"], rel=0.02)
 
 
 @pytest.mark.slow

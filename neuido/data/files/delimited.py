@@ -32,10 +32,10 @@ BROKEN, WORD, THOUSANDS = 2.0, 1.5, 0.01
 """What a cell takes from the score of a dialect: a broken number, a word (a name may be a column), and 1.250 read as 1250."""
 BLOCK = "point"
 """Title of the column that names the trajectory of each row, where a file has one trajectory below the other."""
-_RULE = re.compile(r"[\s|+:]*([-=_]{3,}[\s|+:]*)+")
+_RULE = re.compile(r"[\s|+:]*[-=_]{3,}([\s|+:]+[-=_]{3,})*[\s|+:]*")
 """A line that is drawn between titles and numbers."""
 _MINUS = re.compile(r"\u2212(?=[\d.,])")
-_FORTRAN = re.compile(r"([+-]?(?:\d+[.,]?\d*|[.,]\d+))[dD]([+-]?\d{1,3})")
+_FORTRAN = re.compile(r"([+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+))[dD]([+-]?\d{1,3})")
 """A number of Fortran: 1.25D+02."""
 _BOOKED = re.compile(r"\((\d+[.,]\d+)\)")
 """A negative number of a spreadsheet's accounting: (1.25). Without a decimal sign it may be a footnote."""

@@ -38,3 +38,11 @@ def test_what_is_no_text(tmp_path):
 def test_case_of_decimal_commas(data_root):
     (test,) = read_material_tests(data_root / "cases" / "26-csv-dialects").tests
     assert test.path[1, 0] == 1.05 and test.stress[1, 0] == 56603.6 and len(test.path) == 25
+
+
+@pytest.mark.parametrize("odd", ["1" * 100_000 + "x", "-" * 100_000 + "x", "--- " * 30_000 + "x", "1" * 100_000 + "d", "(" + "1" * 100_000])
+def test_the_time_of_an_odd_line_does_not_grow_with_its_square(tmp_path, odd):
+    """Patterns match each character in one way; this file took minutes or for ever."""
+    path = tmp_path / "a.csv"
+    path.write_text("t,x\n" + "".join(f"{i},{i * i}\n" for i in range(9)) + f"{odd},1\n")
+    assert read_delimited(path).separator == ","

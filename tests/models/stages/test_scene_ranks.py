@@ -1,6 +1,7 @@
 """Adaptation by several processes: each scene ends as in one, the tables hold all, and no rank waits for one that died."""
 
 import os
+import re
 import signal
 import socket
 import time
@@ -94,7 +95,8 @@ def test_a_process_that_dies_ends_all_within_a_minute(tmp_path):
         for process in both:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-    assert time.monotonic() - died < 60 and "Connection closed" in printed  # which `neuido fit` puts into one line
+    assert time.monotonic() - died < 60
+    assert re.search("Connection closed|SIGKILL", printed), "the other process lost it, or torchrun tells of it first"
 
 
 @pytest.mark.slow
