@@ -17,8 +17,11 @@ from neuido.data.footage.filming import Filming, chosen_frames
 from neuido.data.footage.moving_object import background_of, sightings
 from neuido.data.footage.video_frames import read_clip
 from neuido.data.formats import nerfstudio
+from neuido.data.importers.declared_guide import GRAVITY
 from neuido.data.importers.deforming import declared_content
 from neuido.data.importers.tables.checked_folder import write_checked
+from neuido.data.measured.held_start import held_rows
+from neuido.data.measured.motion_plausibility import check_flight
 from neuido.errors import UserError
 from neuido.types import Cameras
 
@@ -53,6 +56,8 @@ class Silhouettes(NamedTuple):
     """Number of frames that show the object."""
     swing: float
     """Largest over smallest area of the whole outlines."""
+    centres: np.ndarray
+    """Times [s] and centres [m] of the whole outlines, (n, 3), y up."""
 
 
 def write_filmed_body(
@@ -107,6 +112,7 @@ def write_filmed_body(
         for name, path in files.items():
             (folder / name).mkdir()
             found = _silhouettes(path, folder / name, filming, sheet, scale, frame_rate)
+            summary.extend(_fall(found.centres, path))
             x0, volume, spacing, words = _body(found.first, scale, thickness, path)
             depth = float(np.abs(x0[:, 2]).max()) + 0.5 * spacing
             arrays = {"x0": x0, "v0": np.zeros_like(x0), "volume": np.full(len(x0), volume / len(x0))}
@@ -138,7 +144,7 @@ def _silhouettes(path: Path, folder: Path, filming: Filming, sheet: Sheet, scale
         raise UserError(f"{path}: {len(chosen)} frames lie between --start and --end; a diagnosis needs at least 4")
     times = clip.times[chosen] - clip.times[chosen[0]]
     background = background_of(clip, np.arange(len(clip.times)), filming.background_file)
-    first, areas, corners = np.zeros(0), [], []
+    first, areas, corners, centres = np.zeros(0), [], [], []
     seen = 0
     (folder / "images").mkdir()
     for t, (image, found) in enumerate(sightings(clip, chosen, background)):
@@ -153,7 +159,9 @@ def _silhouettes(path: Path, folder: Path, filming: Filming, sheet: Sheet, scale
                 )
         if found.area > 0:
             seen += 1
-            areas += [] if found.cut else [found.area]
+            if not found.cut:
+                areas.append(found.area)
+                centres.append((times[t], scale * found.centre[0], scale * (clip.height - found.centre[1])))
             y, x = np.nonzero(found.mask >= INSIDE)
             corners += [(x.min(), clip.height - y.max() - 1), (x.max() + 1, clip.height - y.min())] if len(x) else []
         rgba = np.dstack([image, np.rint(255 * found.mask).astype(np.uint8)])
@@ -166,7 +174,22 @@ def _silhouettes(path: Path, folder: Path, filming: Filming, sheet: Sheet, scale
             f"{path}: outlines differ in area by a factor of {swing:.2g}, as where the body covers its background in most frames: give an "
             "image of the empty scene (--background), or cut the clip (--start, --end)"
         )
-    return Silhouettes(times, first, places.min(axis=0), places.max(axis=0), seen, swing)
+    return Silhouettes(times, first, places.min(axis=0), places.max(axis=0), seen, swing, np.array(centres))
+
+
+def _fall(centres: np.ndarray, path: Path) -> list[str]:
+    """Check the flight of an outline up to its lowest place after the highest; return what is said of its start.
+
+    Raises:
+        UserError: Its acceleration is gravity in another unit or direction.
+    """
+    top = int(np.argmax(centres[:, 2]))
+    t, x, y = centres[: top + int(np.argmin(centres[top:, 2])) + 1].T
+    check_flight(t, y, -GRAVITY, "y", path.name)
+    held = held_rows(t, np.stack([x, y], 1), (0.0, -GRAVITY))
+    if not held:
+        return []
+    return [f"odd: {path.name}: the body is held at first: it keeps its height for longer than a free one can; give --start {t[held]:.4g}"]
 
 
 def _camera(width: int, height: int, scale: float) -> Cameras:

@@ -136,3 +136,18 @@ def test_from_a_video_of_a_body_to_the_missing_effect(tmp_path, capsys, monkeypa
     assert "The model lacks linear air drag" in out and "tells nothing of the line of sight" in out
     (effect,) = neuido.Diagnosis.read(tmp_path / "answer").effects
     assert effect.name == "drag_linear" and effect.parameters["k"].value == pytest.approx(3.0, rel=0.1)
+
+
+def test_a_fall_tells_the_scale_and_a_held_start(ball, tmp_path):
+    path, _ = ball
+    with pytest.raises(UserError, match=r"1e\+03 times model.gravity: the unit is not metres; .*--scale"):
+        neuido.import_file(path, tmp_path / "out", **{**MATERIAL, "scale": 1e3 * drawn.SCALE})
+    times = np.maximum(np.arange(60) / 60 - 0.1, 0.0)
+    held = tmp_path / "held.mp4"
+    places = drawn.pixels(drawn.flight(times, v0=(0.4, 0.0), x0=(0.5, 0.9)))
+    drawn.film(held, (drawn.ball(drawn.scenery(), centre, 15.0) for centre in places))
+    said = neuido.import_file(held, tmp_path / "held", **MATERIAL)
+    (line,) = (line for line in said if "held at first" in line)
+    assert 0.1 <= float(line.rpartition(" ")[2]) < 0.17
+    said = neuido.import_file(held, tmp_path / "later", filming=Filming(start=float(line.rpartition(" ")[2])), **MATERIAL)
+    assert not any("held at first" in line for line in said)

@@ -28,14 +28,15 @@ def write_checked(out: str | os.PathLike | None, fill: Callable[[Path], None], r
     """
 
     def attempt(folder: Path) -> list[str]:
-        fill(folder)
         try:
             with warnings.catch_warnings(record=True) as odd:
                 warnings.simplefilter("always", PlausibilityWarning)
+                fill(folder)
                 read(folder)
         except UserError as error:
             raise UserError(str(error).replace(f"{folder}{os.sep}", "")) from error
-        return [f"odd: {str(each.message).replace(f'{folder}{os.sep}', '')}" for each in odd]
+        said = [str(each.message) for each in odd if issubclass(each.category, PlausibilityWarning)]
+        return [f"odd: {line.replace(f'{folder}{os.sep}', '')}" for line in said]
 
     if out is None:
         with tempfile.TemporaryDirectory() as folder:
