@@ -37,6 +37,11 @@ def build() -> SimpleNamespace:
     flows = wp.array(dtype=wp.vec2, ndim=3)
 
     @func
+    def place_of(thread: int, rows: int, columns: int):
+        """Return the image or pair of a thread, and its row and column there."""
+        return thread // (rows * columns), (thread // columns) % rows, thread % columns
+
+    @func
     def at(image: images, n: int, y: int, x: int):
         """Read a pixel; outside, the nearest one."""
         return image[n, wp.clamp(y, 0, image.shape[1] - 1), wp.clamp(x, 0, image.shape[2] - 1)]
@@ -60,12 +65,7 @@ def build() -> SimpleNamespace:
     @kernel
     def differentiate(image: images, slopes: flows):
         """Differentiate all images by Sobel's masks, which the search takes."""
-        thread = wp.tid()
-        height = image.shape[1]
-        width = image.shape[2]
-        n = thread // (height * width)
-        y = (thread // width) % height
-        x = thread % width
+        n, y, x = place_of(wp.tid(), image.shape[1], image.shape[2])
         along = 2.0 * (at(image, n, y, x + 1) - at(image, n, y, x - 1))
         down = 2.0 * (at(image, n, y + 1, x) - at(image, n, y - 1, x))
         for side in range(2):
@@ -119,10 +119,7 @@ def build() -> SimpleNamespace:
         found: flows,
     ):
         """Move each patch by Gauss-Newton steps from where a flow per pixel, or its neighbours, begin."""
-        thread = wp.tid()
-        p = thread // (rows * columns)
-        i = (thread // columns) % rows
-        j = thread % columns
+        p, i, j = place_of(wp.tid(), rows, columns)
         first = p + p // steps
         top = i * stride
         left = j * stride
@@ -163,12 +160,7 @@ def build() -> SimpleNamespace:
     @kernel
     def densify(image: images, steps: int, stride: int, patches: flows, flow: flows):
         """Set the flow of each pixel to the mean of the patches over it, each with its weight by how well it matches here."""
-        thread = wp.tid()
-        height = flow.shape[1]
-        width = flow.shape[2]
-        p = thread // (height * width)
-        y = (thread // width) % height
-        x = thread % width
+        p, y, x = place_of(wp.tid(), flow.shape[1], flow.shape[2])
         first = p + p // steps
         rows = patches.shape[1]
         columns = patches.shape[2]
@@ -190,12 +182,7 @@ def build() -> SimpleNamespace:
     @kernel
     def take_there(image: images, steps: int, flow: flows, mean: images, change: images):
         """Follow the flow: the mean of both images and their difference at each pixel."""
-        thread = wp.tid()
-        height = flow.shape[1]
-        width = flow.shape[2]
-        p = thread // (height * width)
-        y = (thread // width) % height
-        x = thread % width
+        p, y, x = place_of(wp.tid(), flow.shape[1], flow.shape[2])
         first = p + p // steps
         u = flow[p, y, x]
         here = image[first, y, x]
@@ -214,12 +201,9 @@ def build() -> SimpleNamespace:
         smooth: images,
     ):
         """Set up the equations of the step at each pixel, with the robust weights at the present step."""
-        thread = wp.tid()
         height = flow.shape[1]
         width = flow.shape[2]
-        p = thread // (height * width)
-        y = (thread // width) % height
-        x = thread % width
+        p, y, x = place_of(wp.tid(), height, width)
         d = step[p, y, x]
         g = slope(mean, p, y, x)
         t = change[p, y, x]
@@ -262,12 +246,9 @@ def build() -> SimpleNamespace:
         step: flows,
     ):
         """Relax the step of the pixels of one colour of a chessboard."""
-        thread = wp.tid()
         height = flow.shape[1]
         width = flow.shape[2]
-        p = thread // (height * width)
-        y = (thread // width) % height
-        x = thread % width
+        p, y, x = place_of(wp.tid(), height, width)
         if (x + y) % 2 == colour:
             b = right[p, y, x]
             m = matrix[p, y, x]
