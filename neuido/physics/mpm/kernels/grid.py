@@ -111,11 +111,13 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         return u / (real(1.0) + dt * (force[row, 0] + force[row, 1] * wp.length(u)))
 
     @func
-    def is_clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3)):
+    def is_clamped(x: vec3, s: int, lower: wp.array2d(dtype=vec3), upper: wp.array2d(dtype=vec3), margin: real):
+        """Return whether x lies in a clamp, or within `margin` of one."""
         inside = bool(False)
+        around = vec3(margin, margin, margin)
         for b in range(lower.shape[1]):
-            l = lower[s, b]
-            u = upper[s, b]
+            l = lower[s, b] - around
+            u = upper[s, b] + around
             if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
                 inside = True
         return inside
@@ -162,12 +164,8 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
         for c in range(plane.shape[1]):
             if wp.dot(normal_of(plane[s, c]), x) <= plane[s, c][3] + margin:
                 found = 1
-        around = vec3(margin, margin, margin)
-        for b in range(lower.shape[1]):
-            l = lower[s, b] - around
-            u = upper[s, b] + around
-            if x[0] >= l[0] and x[1] >= l[1] and x[2] >= l[2] and x[0] <= u[0] and x[1] <= u[1] and x[2] <= u[2]:
-                found = 1
+        if is_clamped(x, s, lower, upper, margin):
+            found = 1
         near[node] = wp.uint8(found)
 
     @kernel
@@ -205,7 +203,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 v0 = vec3(g[0], g[1], g[2]) / g[3]
                 out = push(v0, x, dt[s], gravity[s], force, s)
                 if near[node] != wp.uint8(0):
-                    if is_clamped(x, s, lower, upper):
+                    if is_clamped(x, s, lower, upper, real(0.0)):
                         out = vec3(real(0.0), real(0.0), real(0.0))
                     else:
                         out = collide(out, x, s, kind.shape[1], plane, kind, friction, dt[s], force)
@@ -251,7 +249,7 @@ def build(real: type, enable_backward: bool = False) -> SimpleNamespace:
                 free = bool(True)
                 if near[node] != wp.uint8(0):
                     planes = kind.shape[1]
-                    free = not is_clamped(x, s, lower, upper)
+                    free = not is_clamped(x, s, lower, upper, real(0.0))
                 if free:
                     v0 = vec3(g[0], g[1], g[2]) / g[3]
                     u = push(v0, x, dt[s], gravity[s], force, s)
